@@ -84,6 +84,9 @@ def test_what_is_seen_while_lost_becomes_a_sub_map_and_is_tied_when_the_turn_is_
     begun, tied = submaps.index(1), len(submaps) - submaps[::-1].index(1)
     print(f"sub-map from frame {begun} to {tied}, {metrics['unmerged']} frames unmerged, ATE {metrics['final']['ate_rmse_m']:.4f} m")
     assert 260 + Refine().submap_after <= begun <= 285 and 300 < tied < 560 and not map.keyframes.column("submap").any()
+    recognised = map.proposals.column("index")
+    print(f"recognised in frames {recognised.tolist()}")
+    assert len(recognised) >= 3 and recognised[-1] == tied - 1
     assert {pose.status for index, pose in poses.items() if begun <= index < tied} == {"degraded"}
     assert metrics["unmerged"] == 1 and metrics["status"]["lost"] == begun - 60
     assert metrics["final"]["ate_rmse_m"] < 0.01

@@ -532,6 +532,20 @@ PLANE_OBSERVATIONS = Columns(
         "moments": ("f8", (4, 4), Finite()),
     }
 )
+PROPOSALS = Columns(
+    {
+        "index": _ROW,
+        "keyframe": _KEYFRAME,
+        "older_keyframe": _KEYFRAME,
+        "T_keyframe_camera": ("f8", (4, 4), Rotations()),
+        "T_older_camera": ("f8", (4, 4), Rotations()),
+        "covariance": ("f8", (6, 6), Finite()),
+    }
+)
+
+
+def _no_proposals() -> Table:
+    return Table.empty({name: Column(kind, shape) for name, (kind, shape, *_) in PROPOSALS.columns.items()})
 
 
 @dataclass(frozen=True)
@@ -539,9 +553,10 @@ class Map(Value):
     """Keyframes and landmarks; a row number is an id for good, dead rows have `alive` False. Columns are listed in `plugins.mapping.landmarks`.
 
     `revision` counts versions, `loop_closed` is that of the last one with a correction by `loop` or a merged sub-map; a row of `point_observations`
-    and its siblings is a keyframe (row), a landmark, and its measurement."""
+    and its siblings is a keyframe (row), a landmark, and its measurement. A row of `proposals` is a frame of one sub-map that was recognised in an
+    older one: its pose relative to a keyframe of each, and the sum of both covariances (camera frame). Several that agree merge the two."""
 
-    version: ClassVar[int] = 7
+    version: ClassVar[int] = 8
     revision: int
     keyframes: Annotated[Table, KEYFRAMES]
     points: Annotated[Table, POINTS]
@@ -551,6 +566,7 @@ class Map(Value):
     line_observations: Annotated[Table, LINE_OBSERVATIONS]
     plane_observations: Annotated[Table, PLANE_OBSERVATIONS]
     loop_closed: int = 0
+    proposals: Annotated[Table, PROPOSALS] = field(default_factory=_no_proposals)
 
     @cached_property
     def memo(self) -> dict[Hashable, Any]:

@@ -11,10 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from google.protobuf.message import DecodeError
 from mcap_protobuf.schema import build_file_descriptor_set
 
+from trihedron.pipeline.core.constraints import Columns
 from trihedron.pipeline.core.errors import RecordingError, printable
-from trihedron.pipeline.core.types import CALIBRATION, Frame
+from trihedron.pipeline.core.types import CALIBRATION, PROPOSALS, Frame
 from trihedron.pipeline.record.codec import (
     FORMAT,
     FRAMES_TOPIC,
@@ -50,6 +52,9 @@ ADDED_COLUMNS: dict[tuple[str, int], dict[str, tuple[int, ...] | None]] = {
     ("Map", 4): {"world_covariance": None},
     ("Map", 6): {"sensitivity": (6, CALIBRATION), "twist": (6,)},
 }
+
+# likewise -> the tables that it lacks, empty wherever that type is recorded
+ADDED_TABLES: dict[tuple[str, int], dict[str, Columns]] = {("Map", 7): {"proposals": PROPOSALS}}
 
 _Schema = tuple[str, str, bytes, str]  # name, encoding, content, and the encoding of its messages
 
@@ -158,10 +163,11 @@ def _rename_fields(data: bytes) -> bytes:
     """A message with the names, fields and columns of today."""
     message = LegacyMessage.FromString(data)
     if not message.arrays:
-        return data
+        return _add_tables(message, data)
     message.type = RENAMED_TYPES.get(message.type, message.type)
     fields, older = RENAMED_FIELDS.get(message.type, {}), (message.type, message.version)
-    if not fields and older not in ADDED_FIELDS and older not in ADDED_COLUMNS:
+    added = older in ADDED_FIELDS or older in ADDED_COLUMNS or older in ADDED_TABLES
+    if not fields and not added:
         return data
     for array in message.arrays:
         name, mark, rest = array.name.partition("#")
@@ -170,14 +176,35 @@ def _rename_fields(data: bytes) -> bytes:
         with suppress(Exception):  # a stranger's header, of which the decoder will say what is wrong
             for column, shape in ADDED_COLUMNS[older].items():
                 _add_keyframe_column(message, column, shape)
-    if older not in ADDED_FIELDS and older not in ADDED_COLUMNS:
+    if not added:
         return bytes(message.SerializeToString())
     message.version += 1
+    for name, columns in ADDED_TABLES.get(older, {}).items():
+        message.arrays.add(name=f"{name}#", dtype="str", encoding="raw", data=_empty_layout(columns).encode())
     for name, value in ADDED_FIELDS.get(older, {}).items():
         array = np.asarray(value)
         kind = array.dtype.str.lstrip("<") if array.ndim else type(value).__name__
         message.arrays.add(name=name, dtype=kind, shape=array.shape, encoding="raw", data=array.tobytes())
     return _rename_fields(bytes(message.SerializeToString()))  # which may be an older version still
+
+
+def _add_tables(header: Any, data: bytes) -> bytes:
+    """A message of a schema of its own with the empty tables that its version lacks."""
+    older = header.type, header.version
+    if older not in ADDED_TABLES:
+        return data
+    with suppress(DecodeError):  # a damaged message, of which the decoder will say so
+        message = message_class(header.type).FromString(data)
+        message.version += 1
+        for name, columns in ADDED_TABLES[older].items():
+            getattr(message, name).layout = _empty_layout(columns)
+        return bytes(message.SerializeToString())
+    return data
+
+
+def _empty_layout(columns: Columns) -> str:
+    """The layout of an empty table (see `table_codec`)."""
+    return json.dumps({"size": 0, "back": 0, "schema": {name: [kind, shape, 0.0] for name, (kind, shape, *_) in columns.columns.items()}, "rows": {}})
 
 
 def _add_keyframe_column(message: Any, column: str, shape: tuple[int, ...] | None) -> None:

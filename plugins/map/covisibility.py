@@ -25,6 +25,7 @@ from trihedron.plugins.mapping.insertion import (
 )
 from trihedron.plugins.mapping.keyframe_policy import UNCHANGED, KeyframeOptions, keyframe_distance_m, needs_keyframe
 from trihedron.plugins.mapping.landmarks import empty_map, union
+from trihedron.plugins.mapping.merge_verification import propose_merge
 from trihedron.plugins.mapping.merging import merge_lines, merge_planes, merge_points
 from trihedron.plugins.mapping.projection import visible_planes
 from trihedron.plugins.mapping.reference_keyframe import submap_of, transform_to_map
@@ -52,6 +53,7 @@ class Covisibility(KeyframeOptions):
     redundant_share: PositiveShare = 0.9  # of its landmarks (ORB-SLAM)
     merge_deg: float = 4.0  # planes that differ by less, and by less than merge_m on average, become one
     merge_m: float = 0.03  # mean distance of planes that become one
+    verified_by: PositiveInt = 3  # keyframes that agree on the motion between two sub-maps before these are merged; 1 = merge at the first recognised
 
     def __call__(
         self,
@@ -73,8 +75,7 @@ class Covisibility(KeyframeOptions):
         if corrected is not None and loop is not None and len(loop.keyframe_ids) and loop.based_on >= corrected.loop_closed:
             corrected = replace(apply_correction(corrected, loop), loop_closed=corrected.revision + 1)
         if corrected is not None and relocalise is not None and relocalise.status == DEGRADED and pose.status != LOST:
-            here, recognised = transform_to_map(pose, corrected), transform_to_map(relocalise, corrected)
-            corrected = replace(merge_submaps(corrected, here, recognised, self.merge_deg, self.merge_m), loop_closed=corrected.revision + 1)
+            corrected = self._merge(corrected, transform_to_map(pose, corrected), transform_to_map(relocalise, corrected))
         pose = replace(transform_to_map(pose, corrected), submap=submap_of(pose, corrected))
         if corrected is None:
             matches = None
@@ -88,6 +89,15 @@ class Covisibility(KeyframeOptions):
     def localising(self) -> NoMap:
         """Return the plugin that leaves a loaded map as it is."""
         return NoMap()
+
+    def _merge(self, map: Map, pose: Pose, recognised: Pose) -> Map:
+        """The map whose sub-map of `pose` is merged with the one in which it was recognised, or in which that is proposed."""
+        if self.verified_by > 1:
+            map, verified = propose_merge(map, pose, recognised, self.verified_by)
+            if verified is None:
+                return map
+            recognised = verified
+        return replace(merge_submaps(map, pose, recognised, self.merge_deg, self.merge_m), loop_closed=map.revision + 1)
 
     def _version(self, map: Map, frame: Frame) -> Map:
         return replace(map, index=frame.index, stamp_ns=frame.stamp_ns, revision=map.revision + 1)

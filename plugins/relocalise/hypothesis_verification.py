@@ -10,6 +10,7 @@ import numpy as np
 from trihedron.pipeline.core.options import NonNegativeInt, PositiveInt, PositiveShare, Share
 from trihedron.pipeline.core.types import DEGRADED, F64, I32, LOST, OK, Map, Pose
 from trihedron.plugins.mapping.covisibility_graph import are_distinct, keyframes_of, living_keyframes
+from trihedron.plugins.mapping.merge_verification import proposed_submaps
 from trihedron.plugins.mapping.reference_keyframe import reference_of, submap_of
 from trihedron.plugins.places.recognition import block_of, candidate_keyframes
 from trihedron.plugins.places.verification import FrameFeatures, VerifiedPlace, verify_place
@@ -22,7 +23,7 @@ class RelocaliseOptions:
     """Options of relocalisation, whatever makes the hypotheses."""
 
     block: PositiveInt = 80  # keyframes looked at in one frame
-    every: PositiveInt = 5  # frames between looks at older sub-maps, while the camera is tracked in one that is not connected to them
+    every: PositiveInt = 5  # frames between looks at older sub-maps, while tracked in one that is not connected to them and nothing is proposed yet
     candidates: PositiveInt = 20  # of them, whose landmarks make hypotheses
     max_bits: NonNegativeInt = 64  # of 256 between descriptors; the mean of strangers is 128
     ratio: PositiveShare = 0.85  # best to second best descriptor
@@ -45,8 +46,9 @@ def recognise(options: RelocaliseOptions, ways: tuple[Hypotheses, ...], view: Fr
     submaps = _submaps(options, map, submap_of(previous, map), lost, frame.index)
     if not len(submaps):
         return None
-    submap = int(submaps[frame.index % len(submaps)])
-    keyframes = block_of(keyframes_of(map, submap), options.block, frame.index)
+    look = frame.index if lost else frame.index // options.every
+    submap = int(submaps[look % len(submaps)])
+    keyframes = block_of(keyframes_of(map, submap), options.block, look)
     keyframes = candidate_keyframes(map, view.keypoints, view.segments, keyframes, options.candidates, options.max_bits)
     found: list[VerifiedPlace] = []
     for hypotheses in ways:
@@ -64,9 +66,13 @@ def recognise(options: RelocaliseOptions, ways: tuple[Hypotheses, ...], view: Fr
 
 
 def _submaps(options: RelocaliseOptions, map: Map, submap: int, lost: bool, index: int) -> I32:
-    """Sub-maps to search: all for a lost camera; now and then the older ones for one tracked in a sub-map that is not merged with the first."""
+    """Sub-maps to search: all for a lost camera; now and then the older ones for one tracked in a sub-map that is not merged with the first, and in
+    each frame those that a recent proposal would merge it with."""
     known = np.unique(map.keyframes.rows("submap", living_keyframes(map))).astype(np.int32)
-    return known if lost else known[known < submap] if index % options.every == 0 else known[:0]
+    if lost:
+        return known
+    proposed = proposed_submaps(map, submap, index)
+    return proposed if len(proposed) else known[known < submap] if index % options.every == 0 else known[:0]
 
 
 def _accept(options: RelocaliseOptions, place: VerifiedPlace) -> bool:

@@ -22,7 +22,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from landmark_world import World, camera_at, rotation_of, translation_of
 from map_steps import correction
 
-EVERY = Covisibility(min_frames=1, max_frames=1, min_shift=1e-6, min_turn_deg=1e-6)
+EVERY = Covisibility(min_frames=1, max_frames=1, min_shift=1e-6, min_turn_deg=1e-6, verified_by=1)
 AWAY = exp_se3(np.array([3.0, -1.0, 0.5, 0.1, 1.2, -0.3]))  # from the world to that of the sub-map
 
 
@@ -34,10 +34,10 @@ def seen(world, map, index, step, T, **more):
     """The map after the frame seen at `step`, whose pose is said as T."""
     features = world.features(camera_at(step), index)
     matches = LocalMap()(world.frame(index).camera, rotation_of(T, index), translation_of(T, index), *features, map, None) if map else None
-    relocalise, bundle, reference = more.pop("recognised", None), more.pop("bundle", None), more.get("reference", -1)
+    relocalise, bundle, stage, reference = more.pop("recognised", None), more.pop("bundle", None), more.pop("stage", EVERY), more.get("reference", -1)
     if reference >= 0:
         more["T_reference_camera"] = invert(map.keyframes.column("T_world_camera")[reference]) @ T
-    return EVERY(world.frame(index), pose_of(T, index, **more), *features, matches, map, bundle, None, relocalise)
+    return stage(world.frame(index), pose_of(T, index, **more), *features, matches, map, bundle, None, relocalise)
 
 
 @pytest.fixture
@@ -80,6 +80,21 @@ def test_a_sub_map_is_merged_where_the_camera_is_recognised(both):
     expected = transform(invert(AWAY), map.points.rows("position_m", moved))
     assert np.allclose(after.points.rows("position_m", moved)[untouched], expected[untouched], atol=2.0**-20)  # the steps of places
     assert len(set(local_window(after, camera_at(20), 2, 10, 5).keyframes) & set(range(6))) >= 3
+
+
+def test_a_sub_map_is_merged_by_the_third_keyframe_that_is_recognised(both):
+    """The first two only propose it."""
+    world, map = both
+    stage, older = dataclasses.replace(EVERY, verified_by=3), map.keyframes.row("T_world_camera", 5)
+    for index, step in ((12, 33), (17, 36), (22, 39)):
+        T = camera_at(step)
+        recognised = pose_of(T, index, "degraded", reference=5, T_reference_camera=invert(older) @ T)
+        reference = len(map.keyframes) - 1
+        map = seen(world, map, index, step, AWAY @ T, status="degraded", submap=1, reference=reference, recognised=recognised, stage=stage)
+        assert map.keyframes.column("submap")[6:].any() == (index < 22) and (map.loop_closed == map.revision) == (index == 22)
+    poses = map.keyframes.column("T_world_camera")
+    assert len(map.proposals) == 3 and map.planes.column("alive").sum() == 3
+    assert all(np.allclose(poses[row], camera_at(step), atol=1e-6) for row, step in zip(range(6, 15), (*range(12, 36, 4), 33, 34, 35)))
 
 
 def test_an_adjustment_that_began_before_sub_maps_were_merged_does_not_undo_it(both):

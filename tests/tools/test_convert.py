@@ -8,13 +8,17 @@ import numpy as np
 import pytest
 
 from trihedron.pipeline.app.cli import main
+from trihedron.pipeline.core.errors import RecordingError
 from trihedron.pipeline.core.registry import load_plugins, plugin_class
 from trihedron.pipeline.record import upgrade
-from trihedron.pipeline.record.codec import FORMAT, LegacyMessage
+from trihedron.pipeline.record.codec import FORMAT, Encoder, LegacyMessage
 from trihedron.pipeline.record.mcap_file import McapFile
 from trihedron.pipeline.record.mcap_writer import McapWriter
 from trihedron.pipeline.record.reader import Recording
+from trihedron.pipeline.record.schemas import message_class
 from trihedron.pipeline.record.trajectories import read_trajectory
+from trihedron.pipeline.record.writer import RecordingWriter
+from trihedron.plugins.mapping.landmarks import empty_map
 
 CAMERA = "width: 64\nheight: 48\nfx: 50.0\nfy: 50.0\ncx: 31.5\ncy: 23.5\ndepth_scale: 5000\nfps: 30\n"
 COUNT = 12
@@ -150,19 +154,51 @@ def test_renamed_types_and_fields_are_upgraded(tmp_path, monkeypatch, capsys):
     assert main(["diff", str(expected), str(new)]) == 0
 
 
+def test_a_map_without_proposals_is_upgraded(tmp_path):
+    """Version 7 of a map, of the recording's present format, lacks that table, which is empty after it."""
+    recorded, before, after = (tmp_path / f"{name}.mcap" for name in ("recorded", "before", "after"))
+    writer = RecordingWriter(recorded, {})
+    for index in range(3):
+        writer.write("map", empty_map(index, index, 32, 32, 8))
+    writer.close()
+    rewrite(recorded, before, without_proposals)
+    with pytest.raises(RecordingError, match="holds Map version 7, this program reads version 8; upgrade"):
+        list(Recording(before).values("map"))
+    assert main(["convert", str(before), str(after)]) == 0
+    expected, upgraded = (list(Recording(path).values("map")) for path in (recorded, after))
+    assert [Encoder().encode(map) for map in upgraded] == [Encoder().encode(map) for map in expected] and len(upgraded) == 3
+
+
+def without_proposals(data):
+    message = message_class("Map").FromString(data)
+    message.version = 7
+    message.ClearField("proposals")
+    return message.SerializeToString()
+
+
 def write_renamed(source, destination):
     """A recording whose type Map, its table of points and its revision had other names."""
+    rewrite(source, destination, renamed)
+
+
+def renamed(data):
+    message = LegacyMessage.FromString(data)
+    if message.type != "Map":
+        return data
+    message.type = "LandmarkMap"
+    for array in message.arrays:
+        array.name = array.name.replace("points", "corners").replace("revision", "number")
+    return message.SerializeToString()
+
+
+def rewrite(source, destination, change):
+    """Write a recording again with each message's content changed."""
     file, writer, numbers = McapFile(source), McapWriter(destination), {}
     writer.metadata("trihedron", file.metadata["trihedron"])
     for number, stamp_ns, data in file.messages():
         channel, schema = file.channels[number], file.schemas[file.channels[number].schema_id]
         if number not in numbers:
             numbers[number] = writer.channel(channel.topic, schema.name, schema.encoding, schema.data, channel.message_encoding)
-        message = LegacyMessage.FromString(data)
-        if message.type == "Map":
-            message.type = "LandmarkMap"
-            for array in message.arrays:
-                array.name = array.name.replace("points", "corners").replace("revision", "number")
-            data = message.SerializeToString()
+        data = change(data)
         writer.add(len(data), partial(list, [(numbers[number], stamp_ns, data)]))
     writer.close()
