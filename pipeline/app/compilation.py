@@ -80,8 +80,8 @@ def compile_kernels(what: str = "all", variables: Mapping[str, str] = MappingPro
 
 def compile_once(stages: Sequence[str], live: bool) -> None:
     """Fill the cache before a run of these stages, unless that was done for these versions and this processor, or a wheel brought the machine code.
-    For a live run with all that it may come to need. A graph of other stages compiles what it calls as it runs, and so does any run where the variable
-    TRIHEDRON_COMPILE is 0."""
+    For a live run with all that it may come to need. A graph of other stages compiles what it calls as it runs, and so does any run where the
+    variable TRIHEDRON_COMPILE is 0."""
     what = "all" if live else "tracking"
     if archive() is not None:
         return
