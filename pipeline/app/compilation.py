@@ -36,13 +36,14 @@ POINTS = (*ROOM, "normals=none", "planes=none", "lines=none")
 SURFACE = (*ROOM, "outputs=[trajectory,surface]")
 FOUND, UNKNOWN = (*LOST, "dataset.frames=0:100"), (*LOST, "dataset.frames=0:60", "+dataset.options.texture=false")
 TRACKING = ((DIRECTIONS,), (POINTS,))  # runs of each process before a run, which compiles what is left as it comes to it
-ALL = ((DIRECTIONS, SURFACE), (POINTS, FOUND, UNKNOWN))  # and before a live run: also what a surface, a loss and the way back need
+TURN = (*(f"dataset.{word}" for word in SMALL), "dataset.length=300", "dataset.motion=pan")  # round which a loop is closed
+ALL = ((DIRECTIONS, SURFACE), (POINTS, FOUND, UNKNOWN, TURN))  # and before a live run: also what a surface, a loss, the way back and a loop need
 BUILDING, LIVE = (*ROOM, "outputs=[trajectory,building]"), (*ROOM, "live=true")
 AGAIN = ("replay={folder}/0/run.mcap", "only=[surface]", "outputs=[trajectory,surface]")  # of the first run of a process
 EACH = (ROOM, AGAIN, BUILDING, LIVE)
-WHEEL = ((DIRECTIONS, SURFACE), (*EACH, POINTS, FOUND, UNKNOWN))  # and what a wheel carries: also buildings and replays
+WHEEL = ((DIRECTIONS, SURFACE), (*EACH, POINTS, FOUND, UNKNOWN, TURN))  # and what a wheel carries: also buildings and replays
 PARTS = {"tracking": TRACKING, "all": ALL, "wheel": WHEEL}
-FUNCTIONS = {"tracking": 550, "all": 750, "wheel": 850}  # compiled by both processes, about
+FUNCTIONS = {"tracking": 550, "all": 790, "wheel": 860}  # compiled by both processes, about
 STAGES = {"keypoints", "lines", "planes", "manhattan"}  # of the graphs that these runs compile most of
 SWITCH = "TRIHEDRON_COMPILE"  # environment variable: with 0 a run compiles what it calls and nothing beforehand
 GARBAGE = 100_000  # new objects between two collections: nearly all that the compiler makes is short-lived
