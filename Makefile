@@ -62,13 +62,17 @@ docs: install  ## the documentation as a site in build/site; executes the galler
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 	$(BIN)/python docs/site/check.py build/site
 
-release: install  ## wheel and sdist, checked; the wheel installed in an empty environment tracks the demo
-	rm -rf dist build/release
-	$(BIN)/python -m build --no-isolation --outdir dist
+CODE := src/trihedron/machine_code
+release: install  ## wheel with machine code for this Python, and sdist, checked; the wheel, in an empty environment, tracks the demo and compiles nothing
+	rm -rf dist build/release $(CODE)
+	$(BIN)/trihedron compile --archive build/machine_code
+	mkdir $(CODE) && cp build/machine_code/*.zip $(CODE)
+	$(BIN)/python -m build --no-isolation --sdist --wheel --outdir dist; done=$$?; rm -r $(CODE); exit $$done
 	$(BIN)/twine check --strict dist/*
 	$(PYTHON) -m venv build/release/env
 	build/release/env/bin/pip install --quiet --constraint $(LOCK) dist/*.whl
-	cd build/release && env/bin/trihedron run dataset.length=60 out=demo && env/bin/trihedron --version
+	cd build/release && env/bin/trihedron --version && time XDG_CACHE_HOME=cache env/bin/trihedron run dataset.length=60 out=demo 2>said
+	cat build/release/said && ! grep -q compiling build/release/said
 
 lock: $(LOCKER)/bin/uv  ## write constraints.txt: the newest versions of everything on all supported Pythons
 	$< pip compile --quiet --universal --python-version 3.10 --all-extras --upgrade --no-annotate --no-emit-index-url --no-emit-find-links \

@@ -71,7 +71,10 @@ def compiled_text() -> str:
     """Describe the cache of compiled functions."""
     from trihedron.pipeline.app.compilation import PARTS, marker
     from trihedron.pipeline.core.kernel import cache_folder
+    from trihedron.pipeline.core.machine_code import archive, why_unused
 
+    if archive() is not None:
+        return f"complete, brought by this installation, in {cache_folder()}"
     done = [what for what in PARTS if marker(what).exists()]
     state = "complete" if "all" in done else "for tracking" if done else "not yet: the first run compiles, or trihedron compile"
-    return f"{state}, in {cache_folder()}"
+    return f"{state}, in {cache_folder()}; {why_unused()}"

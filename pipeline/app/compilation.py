@@ -15,15 +15,17 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, redirect_stderr, redirect_stdout, suppress
 from importlib.metadata import version
 from pathlib import Path
+from types import MappingProxyType
 
 from llvmlite import binding
 
 from trihedron.pipeline.core.errors import TrihedronError
 from trihedron.pipeline.core.kernel import cache_folder
+from trihedron.pipeline.core.machine_code import BASELINE, archive, pack
 from trihedron.pipeline.run.warm_up import Progress, compilations
 
 SMALL = ("width=160", "height=120")
@@ -34,21 +36,25 @@ POINTS = (*ROOM, "normals=none", "planes=none", "lines=none")
 SURFACE = (*ROOM, "outputs=[trajectory,surface]")
 FOUND, UNKNOWN = (*LOST, "dataset.frames=0:100"), (*LOST, "dataset.frames=0:60", "+dataset.options.texture=false")
 TRACKING = ((DIRECTIONS,), (POINTS,))  # runs of each process before a run, which compiles what is left as it comes to it
-ALL = ((DIRECTIONS, SURFACE), (POINTS, FOUND, UNKNOWN))  # and before a live run: also what a surface, a loss and the way back need
-PARTS = {"tracking": TRACKING, "all": ALL}
-FUNCTIONS = {"tracking": 550, "all": 750}  # compiled by both processes, about
+TURN = (*(f"dataset.{word}" for word in SMALL), "dataset.length=300", "dataset.motion=pan")  # round which a loop is closed
+ALL = ((DIRECTIONS, SURFACE), (POINTS, FOUND, UNKNOWN, TURN))  # and before a live run: also what a surface, a loss, the way back and a loop need
+BUILDING, LIVE = (*ROOM, "outputs=[trajectory,building]"), (*ROOM, "live=true")
+AGAIN = ("replay={folder}/0/run.mcap", "only=[surface]", "outputs=[trajectory,surface]")  # of the first run of a process
+EACH = (ROOM, AGAIN, BUILDING, LIVE)
+WHEEL = ((DIRECTIONS, SURFACE), (*EACH, POINTS, FOUND, UNKNOWN, TURN))  # and what a wheel carries: also buildings and replays
+PARTS = {"tracking": TRACKING, "all": ALL, "wheel": WHEEL}
+FUNCTIONS = {"tracking": 550, "all": 790, "wheel": 860}  # compiled by both processes, about
 STAGES = {"keypoints", "lines", "planes", "manhattan"}  # of the graphs that these runs compile most of
 SWITCH = "TRIHEDRON_COMPILE"  # environment variable: with 0 a run compiles what it calls and nothing beforehand
 GARBAGE = 100_000  # new objects between two collections: nearly all that the compiler makes is short-lived
 
 
-def compile_kernels(what: str = "all") -> float:
-    """Compile the default graph's kernels, `tracking` or `all` of them, with progress on standard error; returns seconds.
-
-    Raises TrihedronError where a process fails."""
+def compile_kernels(what: str = "all", variables: Mapping[str, str] = MappingProxyType({})) -> float:
+    """Compile the default graph's kernels, those of a part of PARTS, with progress on standard error, by processes with these further environment
+    variables; returns seconds. Raises TrihedronError where a process fails."""
     began, progress = time.perf_counter(), Progress(FUNCTIONS[what])
     command = [sys.executable, "-m", __name__]
-    environment = os.environ | {SWITCH: "0"}
+    environment = {**os.environ, SWITCH: "0", **variables}
     workers = [subprocess.Popen([*command, what, str(part)], stdout=subprocess.PIPE, env=environment) for part in range(len(PARTS[what]))]
     lines: queue.SimpleQueue[bytes] = queue.SimpleQueue()
     threads = [threading.Thread(target=_forward, args=(worker, lines), daemon=True) for worker in workers]
@@ -74,12 +80,24 @@ def compile_kernels(what: str = "all") -> float:
 
 
 def compile_once(stages: Sequence[str], live: bool) -> None:
-    """Fill the cache before a run of these stages, unless that was done for these versions and this processor; for a live run with all that it may
-    come to need. A graph of other stages compiles what it calls as it runs, and so does any run where the variable TRIHEDRON_COMPILE is 0."""
+    """Fill the cache before a run of these stages, unless that was done for these versions and this processor, or a wheel brought the machine code.
+    For a live run with all that it may come to need. A graph of other stages compiles what it calls as it runs, and so does any run where the
+    variable TRIHEDRON_COMPILE is 0."""
     what = "all" if live else "tracking"
+    if archive() is not None:
+        return
     if os.environ.get(SWITCH) != "0" and set(stages) >= STAGES and not (marker(what).exists() or marker("all").exists()):
         with suppress(TrihedronError, OSError):  # the run compiles by itself
             compile_kernels(what)
+
+
+def compile_for_wheel(out: Path) -> float:
+    """Compile what a wheel carries, for the baseline of `core.machine_code`, and write its archive; returns seconds. Raises TrihedronError."""
+    with tempfile.TemporaryDirectory() as folder:
+        variables = {"NUMBA_CPU_NAME": BASELINE, "NUMBA_CPU_FEATURES": "", "NUMBA_CACHE_DIR": folder}
+        seconds = compile_kernels("wheel", variables)
+        pack(Path(folder) / cache_folder().name, out)
+    return seconds
 
 
 def marker(what: str) -> Path:
@@ -111,7 +129,8 @@ def _work(what: str, part: int) -> int:
         stack.enter_context(redirect_stderr(nowhere))
         stack.enter_context(compilations(lambda: print(file=out, flush=True)))
         for number, words in enumerate(PARTS[what][part]):
-            failures += command(["run", *words, "threads=1", f"out={folder}/{number}"]) != 0
+            given = [word.format(folder=folder) for word in words]
+            failures += command(["run", *given, "threads=1", f"out={folder}/{number}"]) != 0
     return min(failures, 1)
 
 

@@ -2,7 +2,8 @@
 
 A kernel is compiled by numba when it is first called with arguments of new types, and loaded from the cache in later processes. numba's own cache
 compares the source file of a kernel only; this one compares every file that the kernel's module imports from the project, so that a change of a
-called function or of an imported constant is noticed. The folders are named by module and content: environments with equal sources share them.
+called function or of an imported constant is noticed. The folders are named by module and content: environments with equal sources share them. A
+wheel brings them along (`core.machine_code`).
 """
 
 from __future__ import annotations
@@ -18,6 +19,8 @@ from typing import Any, ParamSpec, TypeVar, overload
 
 import numba
 import numpy as np
+
+from trihedron.pipeline.core.machine_code import BASELINE, archive, unpack
 
 PACKAGE = __name__.partition(".")[0]
 ROOT = Path(__file__).parents[2]  # of the package
@@ -54,7 +57,8 @@ def constant(array: Any, dtype: type[np.generic]) -> Any:
 def cache_folder() -> Path:
     """Folder of compiled kernels: NUMBA_CACHE_DIR, else `trihedron/kernels` in the user's cache folder (XDG_CACHE_HOME, else ~/.cache)."""
     user = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    return (Path(CONFIG.CACHE_DIR) if CONFIG.CACHE_DIR else user / PACKAGE / "kernels") / f"numba-{numba.__version__}"
+    target = f"-{BASELINE}" if archive() is not None else ""
+    return (Path(CONFIG.CACHE_DIR) if CONFIG.CACHE_DIR else user / PACKAGE / "kernels") / f"numba-{numba.__version__}{target}"
 
 
 class KernelCache:
@@ -77,7 +81,8 @@ class KernelCache:
         return locator
 
     def ensure_cache_path(self) -> None:
-        """Make the folder. Raises OSError where nothing can be written."""
+        """Make the folder, with what a wheel brings of it. Raises OSError where nothing can be written."""
+        unpack(self._path)
         if not _writable(self._path):
             raise PermissionError(self._path)
 
@@ -136,4 +141,6 @@ def _file(module: str) -> Path:
 
 
 _OTHERS = CONFIG.CACHE_LOCATOR_CLASSES or "UserProvidedCacheLocator,InTreeCacheLocator,UserWideCacheLocator,IPythonCacheLocator,ZipCacheLocator"
+if archive() is not None:
+    CONFIG.CPU_NAME, CONFIG.CPU_FEATURES = BASELINE, ""  # of which LLVM knows the features
 CONFIG.CACHE_LOCATOR_CLASSES = f"{__name__}.{KernelCache.__name__},{_OTHERS}"

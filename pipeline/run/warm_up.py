@@ -13,6 +13,7 @@ from numba.core import event
 from tqdm import tqdm
 
 from trihedron.pipeline.core.errors import TrihedronError
+from trihedron.pipeline.core.machine_code import carried, why_unused
 from trihedron.pipeline.run.memory import malloc_trim
 from trihedron.pipeline.run.runner import Runner
 
@@ -40,7 +41,8 @@ class Progress:
         self.count += 1
         now = time.perf_counter()
         if self.count == 1:
-            print(f"{COMPILING} ...", file=sys.stderr, flush=True)
+            because = f" ({why_unused()})" if carried() and why_unused() else ""
+            print(f"{COMPILING}{because} ...", file=sys.stderr, flush=True)
             self._began = self._printed = now
             self._bar = tqdm(total=self._total, unit="function", leave=False) if shows_bars() else None
         if self._bar is not None:
