@@ -6,6 +6,7 @@ agree. A proposal is stored relative to a keyframe of each sub-map, so that it f
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from itertools import combinations
 
@@ -70,7 +71,7 @@ def _repeats(map: Map, latest: I32, pose: Pose) -> bool:
     """True where the latest proposal (at most one row) is of this frame's view."""
     keyframes, T_keyframe_camera = map.proposals.columns_at(latest, "keyframe", "T_keyframe_camera")
     T_camera = matmul(map.keyframes.rows("T_world_camera", keyframes), T_keyframe_camera)
-    return any(np.linalg.norm(T[:3, 3]) < VIEW_M and rotation_angle_deg(T[:3, :3]) < VIEW_DEG for T in matmul(invert(T_camera), pose.T_world_camera))
+    return any(math.hypot(*T[:3, 3]) < VIEW_M and rotation_angle_deg(T[:3, :3]) < VIEW_DEG for T in matmul(invert(T_camera), pose.T_world_camera))
 
 
 def _add_proposal(map: Map, recent: I32, pose: Pose, recognised: Pose) -> tuple[Map, I32]:

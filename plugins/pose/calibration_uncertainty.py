@@ -24,7 +24,7 @@ from trihedron.plugins.shared.pose_optimizer import PoseSolution
 from trihedron.plugins.shared.pose_optimizer_kernels import Flags
 
 REPEATED_FRAMES = 20  # in which the errors of a landmark's residuals repeat: so many frames tell of the calibration as much as one
-CALIBRATION_SIGMAS = 3.0  # root mean square of the parameters beyond which the calibration is not that of the camera
+CALIBRATION_SIGMAS = 2.0  # root mean square of the parameters beyond which the calibration is not that of the camera
 LONGEST_S = 1.0  # between two frames that a velocity is taken from
 
 
