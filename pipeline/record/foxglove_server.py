@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from typing import Any
 
 import foxglove
@@ -11,6 +12,7 @@ from trihedron.pipeline.core.errors import ConfigError
 HOST = "127.0.0.1"  # nobody but this machine
 SHOWN = ("/view/", "/tf", "/error", "/timing")  # beginnings of the channels that are sent
 BACKLOG = 256  # messages that wait for a client
+CLOSING_S = 2.0  # that closing waits for clients to be disconnected
 
 
 class FoxgloveServer:
@@ -32,8 +34,10 @@ class FoxgloveServer:
         return f"ws://localhost:{self._server.port}"
 
     def close(self) -> None:
-        """Disconnect all clients."""
-        self._server.stop()
+        """Disconnect all clients. One that connected and says nothing keeps the server from stopping: it is left to the end of the process."""
+        stopping = threading.Thread(target=self._server.stop, daemon=True)
+        stopping.start()
+        stopping.join(CLOSING_S)
 
 
 def _is_shown(channel: Any) -> bool:

@@ -209,3 +209,12 @@ def test_a_recording_without_a_file_writes_nowhere() -> None:
     writer.write("map", Map.__new__(Map))  # is not encoded
     writer.close()
     server.close()
+
+
+def test_a_client_that_says_nothing_does_not_hold_the_run() -> None:
+    """A connection without a handshake: closing ends after two seconds, and so does the process."""
+    program = (
+        "import socket; from trihedron.pipeline.record.foxglove_server import FoxgloveServer; server = FoxgloveServer(0); "
+        "silent = socket.create_connection(('127.0.0.1', int(server.url.rpartition(':')[2]))); server.close(); print('closed')"
+    )
+    assert subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60).stdout == "closed\n"
