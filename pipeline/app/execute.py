@@ -254,7 +254,7 @@ def _progress(steps: Iterator[Step]) -> Iterator[Step]:
 def write_files(
     runner: Runner, truth: Trajectory | None, out: Path, started: float, began: float, plot: bool = True
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Write the files beside the recording; returns metrics and times. A trajectory, with its picture if `plot`, is there only with poses."""
+    """Write the files beside the recording; returns metrics and times. A trajectory is there only with poses, its picture if `plot` only with two."""
     metrics: dict[str, Any] = {}
     timing = runner.timing.summary(runner.threads, time.perf_counter() - started, started - began)
     if runner.feed is not None:
@@ -264,7 +264,7 @@ def write_files(
             result = results.with_unpacked_poses(runner.result)
             final = results.final_trajectory(result)
             metrics = results.write_results(out, result, final, truth)
-            if plot and len(final):
+            if plot and len(final) > 1:
                 trajectory_figure(final, truth, out / PLOT, [(pose.stamp_ns, pose.status) for pose in result.poses])
         results.write_json(out / results.TIMING, timing)
     except OSError as error:

@@ -170,6 +170,12 @@ def test_a_run_folder_is_complete(capsys, tmp_path, monkeypatch):
     assert recording.channels["/view/pose"].message_encoding == "protobuf"
 
 
+def test_one_pose_has_no_picture(tmp_path, monkeypatch):
+    monkeypatch.setattr(execute, "trajectory_figure", trajectory_figure)
+    assert main(["run", "dataset.length=1", "dataset.width=160", "dataset.height=120", f"out={tmp_path}"]) == 0
+    assert (tmp_path / "trajectory.txt").exists() and not (tmp_path / "trajectory.png").exists()
+
+
 @pytest.mark.slow
 def test_a_replay_finds_the_data_from_another_folder(tmp_path, monkeypatch):
     assert main(["run", *SMALL, "record.frames=true", "out=embedded"]) == 0
