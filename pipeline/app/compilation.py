@@ -15,11 +15,10 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack, redirect_stderr, redirect_stdout, suppress
 from importlib.metadata import version
 from pathlib import Path
-from types import MappingProxyType
 
 from llvmlite import binding
 
@@ -40,18 +39,26 @@ TURN = (*(f"dataset.{word}" for word in SMALL), "dataset.length=300", "dataset.m
 ALL = ((DIRECTIONS, SURFACE), (POINTS, FOUND, UNKNOWN, TURN))  # and before a live run: also what a surface, a loss, the way back and a loop need
 BUILDING, LIVE = (*ROOM, "outputs=[trajectory,building]"), (*ROOM, "live=true")
 AGAIN = ("replay={folder}/0/run.mcap", "only=[surface]", "outputs=[trajectory,surface]")  # of the first run of a process
-EACH = (ROOM, AGAIN, BUILDING, LIVE)
-WHEEL = ((DIRECTIONS, SURFACE), (*EACH, POINTS, FOUND, UNKNOWN, TURN))  # and what a wheel carries: also buildings and replays
+WHEEL = ((DIRECTIONS, SURFACE), (ROOM, AGAIN, BUILDING, LIVE, POINTS, FOUND, UNKNOWN, TURN))  # and for a wheel: also buildings and replays
 PARTS = {"tracking": TRACKING, "all": ALL, "wheel": WHEEL}
-FUNCTIONS = {"tracking": 550, "all": 790, "wheel": 860}  # compiled by both processes, about
+FUNCTIONS = {"tracking": 550, "all": 910, "wheel": 1130}  # compiled by both processes, about
 STAGES = {"keypoints", "lines", "planes", "manhattan"}  # of the graphs that these runs compile most of
 SWITCH = "TRIHEDRON_COMPILE"  # environment variable: with 0 a run compiles what it calls and nothing beforehand
 GARBAGE = 100_000  # new objects between two collections: nearly all that the compiler makes is short-lived
 
 
-def compile_kernels(what: str = "all", variables: Mapping[str, str] = MappingProxyType({})) -> float:
-    """Compile the default graph's kernels, those of a part of PARTS, with progress on standard error, by processes with these further environment
-    variables; returns seconds. Raises TrihedronError where a process fails."""
+def compile_kernels(what: str = "all") -> float:
+    """Compile the default graph's kernels, `tracking` or `all` of them, with progress on standard error; returns seconds.
+
+    Raises TrihedronError where a process fails."""
+    seconds = _compile(what)
+    marker(what).parent.mkdir(parents=True, exist_ok=True)
+    marker(what).touch()
+    return seconds
+
+
+def _compile(what: str, **variables: str) -> float:
+    """Compile a part of PARTS in processes with these further environment variables; returns seconds. Raises TrihedronError."""
     began, progress = time.perf_counter(), Progress(FUNCTIONS[what])
     command = [sys.executable, "-m", __name__]
     environment = {**os.environ, SWITCH: "0", **variables}
@@ -74,8 +81,6 @@ def compile_kernels(what: str = "all", variables: Mapping[str, str] = MappingPro
         progress.close()
     if any(worker.returncode for worker in workers):
         raise TrihedronError("compile", "not all functions were compiled", "see that 2 GB of memory are free, then repeat: trihedron compile --debug")
-    marker(what).parent.mkdir(parents=True, exist_ok=True)
-    marker(what).touch()
     return time.perf_counter() - began
 
 
@@ -94,8 +99,7 @@ def compile_once(stages: Sequence[str], live: bool) -> None:
 def compile_for_wheel(out: Path) -> float:
     """Compile what a wheel carries, for the baseline of `core.machine_code`, and write its archive; returns seconds. Raises TrihedronError."""
     with tempfile.TemporaryDirectory() as folder:
-        variables = {"NUMBA_CPU_NAME": BASELINE, "NUMBA_CPU_FEATURES": "", "NUMBA_CACHE_DIR": folder}
-        seconds = compile_kernels("wheel", variables)
+        seconds = _compile("wheel", NUMBA_CPU_NAME=BASELINE, NUMBA_CPU_FEATURES="", NUMBA_CACHE_DIR=folder)
         pack(Path(folder) / cache_folder().name, out)
     return seconds
 

@@ -2,7 +2,7 @@
 
 An archive holds the folders of the cache of kernels (`core.kernel`), and is of one version of Python, numba and llvmlite, and of x86-64-v3: AVX2, FMA
 and what came with them, which Intel's and AMD's processors have had since 2013 and 2015. Where it fits, kernels are loaded from it, and what it lacks
-is compiled for the same baseline; numba tells machine code of different targets apart. Where it does not, kernels are compiled for the processor.
+is compiled for the same baseline; numba distinguishes machine code by its target. Where it does not, kernels are compiled for the processor.
 """
 
 from __future__ import annotations

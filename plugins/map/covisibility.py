@@ -53,7 +53,7 @@ class Covisibility(KeyframeOptions):
     redundant_share: PositiveShare = 0.9  # of its landmarks (ORB-SLAM)
     merge_deg: float = 4.0  # planes that differ by less, and by less than merge_m on average, become one
     merge_m: float = 0.03  # mean distance of planes that become one
-    verified_by: PositiveInt = 3  # keyframes that agree on the motion between two sub-maps before these are merged; 1 = merge at the first recognised
+    verified_by: PositiveInt = 3  # views that agree on the motion between two sub-maps before these are merged; 1 = merge at the first recognised
 
     def __call__(
         self,

@@ -93,7 +93,8 @@ def status_by_matches(options: JudgementOptions, evidence: Evidence) -> Tracking
 
 
 def status_by_images(status: TrackingStatus, evidence: Evidence, repeats: int) -> TrackingStatus:
-    """Judge further by what is known of this frame besides; `repeats` images in a row repeat the one before."""
+    """Judge further by the images and the sub-map: the reason names blur; a pose in a sub-map that is not merged is degraded, and so is one of
+    `repeats` images in a row, more than one, that repeat the one before."""
     problem = evidence.problem
     if problem.keypoints.blur_px >= BLURRED_PX:
         status = replace(status, reason=f"{status.reason}; the image is blurred by {problem.keypoints.blur_px:.1f} px: turn slower")

@@ -5,6 +5,7 @@ import os
 import re
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 
 import numba
@@ -163,6 +164,13 @@ def test_a_failed_process_is_an_error_and_leaves_no_marker(tmp_path, monkeypatch
     assert not compilation.marker("all").exists()
 
 
+def test_what_is_compiled_for_a_wheel_is_not_in_the_cache_of_the_user(tmp_path, monkeypatch):
+    monkeypatch.setattr(kernels.CONFIG, "CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.setattr(compilation, "PARTS", {"wheel": ()})  # no process, so that nothing is compiled
+    compilation.compile_for_wheel(tmp_path / "code.zip")
+    assert zipfile.is_zipfile(tmp_path / "code.zip") and not (tmp_path / "cache").exists()
+
+
 @pytest.mark.slow
 def test_a_second_start_loads_what_the_first_compiled(tmp_path):
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
@@ -179,6 +187,6 @@ def test_a_second_start_loads_what_the_first_compiled(tmp_path):
 def test_a_run_after_compiling_ahead_compiles_nothing(tmp_path):
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
     subprocess.run([*RUN[:-1], "compile"], env=environment, check=True, cwd=tmp_path)
-    for number, words in enumerate([compilation.SURFACE, compilation.FOUND, compilation.UNKNOWN]):
+    for number, words in enumerate([compilation.SURFACE, compilation.FOUND, compilation.UNKNOWN, compilation.TURN]):
         done = subprocess.run([*RUN, *words, f"out={tmp_path / str(number)}"], env=environment, capture_output=True, text=True, cwd=tmp_path)
         assert done.returncode == 0 and COMPILES not in done.stderr

@@ -95,7 +95,7 @@ def printed(package, cache, **variables):
     return json.loads(subprocess.run([sys.executable, "-c", PROGRAM], env=environment, capture_output=True, check=True, timeout=120).stdout)
 
 
-@pytest.mark.skipif(bool(machine_code.binding.get_host_cpu_features().get("avx2")) is False, reason="the processor has no AVX2")
+@pytest.mark.skipif(not machine_code.binding.get_host_cpu_features().get("avx2"), reason="the processor has no AVX2")
 def test_a_kernel_of_the_wheel_is_not_compiled_and_gives_equal_bytes(tmp_path):
     package = tmp_path / "installed" / "trihedron"
     shutil.copytree(PACKAGE, package, ignore=shutil.ignore_patterns("__pycache__", "machine_code"))

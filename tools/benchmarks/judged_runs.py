@@ -201,14 +201,22 @@ def alarm_figure(test: str) -> Figure:
     return Figure(test, "share %", lambda check: share_of(check.not_ok.get(test, 0), check), 100.0, 2, limits=SHARE)
 
 
-def rank_by_sigma(found: Sequence[JudgedCase]) -> Row | None:
-    """Return Spearman's rank correlation of the σ that runs of simulated sensors state, which needs no truth, with their ATE, and the number of these
-    runs; None for fewer than three."""
+def rank_correlation(pairs: Iterable[tuple[float | None, float | None]]) -> tuple[float | None, int]:
+    """Return Spearman's rank correlation of the pairs that are known, None of fewer than three or where one figure is always the same; and their
+    number."""
     from scipy.stats import spearmanr
 
-    checks = [one.check for one in found if SENSOR in one.case.groups]
-    pairs = [(check.sigma_m, check.ate_m) for check in checks if check.sigma_m is not None and check.ate_m is not None]
-    return {"rank_correlation": float(spearmanr(*zip(*pairs))[0]), "runs": len(pairs)} if len(pairs) >= LEAST_RUNS else None
+    known = np.array([pair for pair in pairs if None not in pair], float).reshape(-1, 2)
+    known = known[np.isfinite(known).all(axis=1)]
+    varies = len(known) >= LEAST_RUNS and np.ptp(known, axis=0).min() > 0.0
+    return float(spearmanr(known[:, 0], known[:, 1])[0]) if varies else None, len(known)
+
+
+def rank_by_sigma(found: Sequence[JudgedCase]) -> Row | None:
+    """Return the rank correlation of the σ that runs of simulated sensors state, which needs no truth, with their ATE, and the number of these runs;
+    None where there are too few."""
+    rho, runs = rank_correlation((one.check.sigma_m, one.check.ate_m) for one in found if SENSOR in one.case.groups)
+    return {"rank_correlation": rho, "runs": runs} if rho is not None else None
 
 
 def rank_sentence(rank: Row) -> str:

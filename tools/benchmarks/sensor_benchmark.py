@@ -16,12 +16,21 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from trihedron.pipeline.core.errors import UsageError
 from trihedron.pipeline.core.text_table import table
 from trihedron.tools.arguments import Parser
-from trihedron.tools.benchmarks.judged_runs import SENSOR, Case, JudgedCase, check_overrides, chosen, judged_cases, kept_or_temporary, plain, report
+from trihedron.tools.benchmarks.judged_runs import (
+    SENSOR,
+    Case,
+    JudgedCase,
+    check_overrides,
+    chosen,
+    judged_cases,
+    kept_or_temporary,
+    plain,
+    rank_correlation,
+    report,
+)
 
 SENSORS = ("kinect_v1", "tof", "realsense_stereo", "hololens", "phone")
 ROOMS = {  # name -> what the data set is given
@@ -95,17 +104,11 @@ def _quality(run: Path) -> dict[str, float]:
 
 def correlations(found: Sequence[tuple[dict[str, Any], float | None]]) -> str:
     """Make the table of Spearman's rank correlation of each figure without truth with the ATE over the runs (figures, ATE)."""
-    from scipy.stats import spearmanr
-
     names = list(dict.fromkeys(name for figures, _ in found for name in figures if name not in COUNTS))
     rows = [["figure without truth", "rank correlation with ATE", "runs"]]
     for name in names:
-        pairs = [(figures.get(name), ate_m) for figures, ate_m in found]
-        known = np.array([pair for pair in pairs if None not in pair], float).reshape(-1, 2)
-        known = known[np.isfinite(known).all(axis=1)]
-        varies = len(known) > 2 and np.ptp(known, axis=0).min() > 0.0
-        rho = f"{spearmanr(known[:, 0], known[:, 1])[0]:+.2f}" if varies else "-"
-        rows.append([name, rho, str(len(known))])
+        rho, runs = rank_correlation((figures.get(name), ate_m) for figures, ate_m in found)
+        rows.append([name, "-" if rho is None else f"{rho:+.2f}", str(runs)])
     return table(rows, "lrr")
 
 
