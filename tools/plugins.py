@@ -21,13 +21,13 @@ from trihedron.tools.arguments import Parser
 
 
 def main(argv: list[str]) -> int:
-    """Run the command; returns the exit code. Raises UsageError for an unknown slot, PluginError for a plugin that does not load."""
+    """Run the command; returns the exit code. Raises UsageError for an unknown slot or plugin."""
     parser = Parser("plugins", __name__)
     parser.add_argument("slot", metavar="SLOT", nargs="?", help="only this slot")
     parser.add_argument("plugin", metavar="PLUGIN", nargs="?", help="only this plugin of it, with its options")
     parser.add_argument("--json", action="store_true", help="print everything as JSON")
     arguments = parser.parse_args(argv)
-    from trihedron.pipeline.core.registry import load_plugins
+    from trihedron.pipeline.core.registry import broken_packages, load_plugins
     from trihedron.pipeline.core.slots import SLOTS
 
     if arguments.slot is not None and arguments.slot not in SLOTS:
@@ -37,19 +37,21 @@ def main(argv: list[str]) -> int:
     if arguments.plugin is not None:
         described[0]["plugins"] = [_chosen(described[0], arguments.plugin)]
     if arguments.json:
-        print(json.dumps({"slots": described}, indent=2))
+        print(json.dumps({"slots": described, "broken": broken_packages()}, indent=2))
     elif arguments.plugin is not None:
         print(report_plugin(arguments.slot, described[0]["plugins"][0]))
     else:
-        print(report_names(described) if arguments.slot is None else report(described[0]))
+        print(report_names(described, broken_packages()) if arguments.slot is None else report(described[0]))
     return 0
 
 
 def _chosen(slot: dict[str, Any], name: str) -> dict[str, Any]:
     """The plugin of that name. Raises UsageError where there is none."""
+    from trihedron.pipeline.core.registry import cure_of_unknown
+
     plugins = {plugin["name"]: plugin for plugin in slot["plugins"]}
     if name not in plugins:
-        raise UsageError("plugins", f"the slot '{slot['name']}' has no plugin '{name}'", did_you_mean(name, plugins))
+        raise UsageError("plugins", f"the slot '{slot['name']}' has no plugin '{name}'", cure_of_unknown(slot["name"], name))
     chosen: dict[str, Any] = plugins[name]
     return chosen
 
@@ -118,10 +120,11 @@ def _plain(value: Any) -> Any:
     return [_plain(item) for item in value] if isinstance(value, (tuple, list)) else value
 
 
-def report_names(slots: list[dict[str, Any]]) -> str:
-    """Format the slots for people: a line of names each."""
+def report_names(slots: list[dict[str, Any]], broken: dict[str, str]) -> str:
+    """Format the slots for people: a line of names each, then a line for each package that does not load, with its error."""
     names = [[slot["name"], ", ".join("*" * plugin["default"] + plugin["name"] for plugin in slot["plugins"])] for slot in slots]
-    return f"{table(names, 'll')}\n\ntrihedron plugins SLOT describes each, trihedron plugins SLOT PLUGIN its options"
+    lines = [table(names, "ll"), "", "trihedron plugins SLOT describes each, trihedron plugins SLOT PLUGIN its options"]
+    return "\n".join([*lines, *(f"broken: {package} does not load: {cause}; mend it or uninstall it" for package, cause in broken.items())])
 
 
 def report(slot: dict[str, Any]) -> str:

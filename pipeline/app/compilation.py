@@ -44,6 +44,7 @@ PARTS = {"tracking": TRACKING, "all": ALL, "wheel": WHEEL}
 FUNCTIONS = {"tracking": 550, "all": 910, "wheel": 1130}  # compiled by both processes, about
 STAGES = {"keypoints", "lines", "planes", "manhattan"}  # of the graphs that these runs compile most of
 SWITCH = "TRIHEDRON_COMPILE"  # environment variable: with 0 a run compiles what it calls and nothing beforehand
+_ONCE = threading.Lock()  # runs that begin in several threads at once compile once
 GARBAGE = 100_000  # new objects between two collections: nearly all that the compiler makes is short-lived
 
 
@@ -91,9 +92,10 @@ def compile_once(stages: Sequence[str], live: bool) -> None:
     what = "all" if live else "tracking"
     if archive() is not None:
         return
-    if os.environ.get(SWITCH) != "0" and set(stages) >= STAGES and not (marker(what).exists() or marker("all").exists()):
-        with suppress(TrihedronError, OSError):  # the run compiles by itself
-            compile_kernels(what)
+    with _ONCE:
+        if os.environ.get(SWITCH) != "0" and set(stages) >= STAGES and not (marker(what).exists() or marker("all").exists()):
+            with suppress(TrihedronError, OSError):  # the run compiles by itself
+                compile_kernels(what)
 
 
 def compile_for_wheel(out: Path) -> float:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
+import threading
 from collections.abc import Iterable, Mapping
 from enum import Enum
 from importlib.resources import files
@@ -24,11 +25,12 @@ from trihedron.pipeline.core.graph import Graph, build_graph
 from trihedron.pipeline.core.libraries import library_error
 from trihedron.pipeline.core.overrides import with_literal_paths
 from trihedron.pipeline.core.plugin_configs import PLUGIN_KEY, offer_plugins, with_defaults
-from trihedron.pipeline.core.registry import load_plugins, options_of, plugin_class, plugins_of
+from trihedron.pipeline.core.registry import cure_of_unknown, load_plugins, options_of, plugin_class, plugins_of
 from trihedron.pipeline.core.slots import SLOTS, Localising, default_wires
 
 RECORDED_GRAPH = "recorded"  # in a replay: the option of `graph` with the wires of the recording
 SWEEPER, SEARCH, DASK = (f"hydra_plugins.trihedron.{name}" for name in ("Sweeper", "Search", "Dask"))  # `_target_` of Hydra's groups
+_COMPOSING = threading.Lock()  # Hydra has one state, and one ConfigStore, for the whole process
 
 
 class Feedback(Enum):
@@ -221,14 +223,15 @@ def compose_run(overrides: Iterable[str], recorded: RecordedConfig | None = None
 
 
 def composed_each(overrides: Iterable[Iterable[str]], recorded: RecordedConfig | None = None) -> list[DictConfig]:
-    """Compose one configuration for each list of overrides. Raises TrihedronError, one line."""
+    """Compose one configuration for each list of overrides; other threads wait. Raises TrihedronError, one line."""
     load_plugins()
-    register_configs(recorded)
-    try:
-        with initialize_config_module("trihedron.conf", version_base="1.3"):
-            return [compose("root", overrides=with_literal_paths(words)) for words in overrides]
-    except Exception as error:
-        raise rewrite_error(error) from error
+    with _COMPOSING:
+        register_configs(recorded)
+        try:
+            with initialize_config_module("trihedron.conf", version_base="1.3"):
+                return [compose("root", overrides=with_literal_paths(words)) for words in overrides]
+        except Exception as error:
+            raise rewrite_error(error) from error
 
 
 def rewrite_error(error: Exception) -> TrihedronError:
@@ -257,8 +260,9 @@ def rewrite_error(error: Exception) -> TrihedronError:
 def _unknown_option(group: str, name: str, options: list[str]) -> TrihedronError:
     if name.startswith("submitit"):
         return library_error("hydra_plugins.hydra_submitit_launcher")
-    what = f"there is no plugin '{name}' for the slot '{group}'" if group in SLOTS else f"there is no {group} '{name}'"
-    return ConfigError(group, what, did_you_mean(name, options))
+    if group in SLOTS:
+        return ConfigError(group, f"there is no plugin '{name}' for the slot '{group}'", cure_of_unknown(group, name))
+    return ConfigError(group, f"there is no {group} '{name}'", did_you_mean(name, options))
 
 
 def _unknown_key(key: str) -> TrihedronError:

@@ -7,15 +7,17 @@ import functools
 import importlib
 import inspect
 import pkgutil
+import sys
+import threading
 from collections.abc import Callable
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
 
 import numpy as np
 
 from trihedron.pipeline.core.drawings import Drawing
-from trihedron.pipeline.core.errors import LibraryError, PluginError, did_you_mean
+from trihedron.pipeline.core.errors import PluginError, TrihedronError, did_you_mean, printable
 from trihedron.pipeline.core.options import check_options
 from trihedron.pipeline.core.slots import FOLDS, RESERVED, SLOTS, inputs_of, method_of, output_of, strip_none
 from trihedron.pipeline.core.types import F64, Pose, Value
@@ -26,6 +28,8 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 _PLUGINS: dict[str, dict[str, type[Any]]] = {slot: {} for slot in SLOTS}
 _BUILT_IN = ("trihedron.datasets", "trihedron.plugins")
 ENTRY_POINT_GROUP = "trihedron.plugins"
+_BROKEN: dict[EntryPoint, str] = {}  # packages of plugins that do not load, and why
+_LOADING = threading.RLock()
 FileWriter = Callable[[Path, Any], list[str]]
 _FILES: dict[str, FileWriter] = {}
 CovariancePart = Callable[[Pose], F64]
@@ -132,8 +136,14 @@ def plugin_class(slot: str, name: str) -> type[Any]:
     if slot not in SLOTS:
         raise PluginError(slot, f"there is no slot '{slot}'", did_you_mean(slot, SLOTS))
     if name not in _PLUGINS[slot]:
-        raise PluginError(slot, f"there is no plugin '{name}' for the slot '{slot}'", did_you_mean(name, _PLUGINS[slot]))
+        raise PluginError(slot, f"there is no plugin '{name}' for the slot '{slot}'", cure_of_unknown(slot, name))
     return _PLUGINS[slot][name]
+
+
+def cure_of_unknown(slot: str, name: str) -> str:
+    """Return the cure for a plugin's name that is unknown: the closest names, and the packages of plugins that do not load, as it may be in one."""
+    broken = [f"it may be in {package}, which does not load: {error}" for package, error in broken_packages().items()]
+    return "; ".join([did_you_mean(name, _PLUGINS[slot]), *broken])
 
 
 def _register_in(known: dict[Key, Function], key: Key) -> Callable[[Function], Function]:
@@ -200,13 +210,26 @@ def _load_built_in() -> None:
 
 
 def load_plugins() -> None:
-    """Import every built-in plugin and each module of the entry-point group `trihedron.plugins`. Raises PluginError for one that does not load."""
-    _load_built_in()
-    for entry in entry_points(group=ENTRY_POINT_GROUP):
-        try:
-            entry.load()
-        except (PluginError, LibraryError):
-            raise
-        except Exception as error:
-            place = f"plugin package {entry.dist.name if entry.dist else entry.name} ({entry.value})"
-            raise PluginError(place, f"does not load: {type(error).__name__}: {error}", "mend it or uninstall it") from error
+    """Import every built-in plugin and each module of the entry-point group `trihedron.plugins`. A package that does not load is reported once, on
+    standard error, and left out; its plugins are unknown names."""
+    with _LOADING:
+        _load_built_in()
+        for entry in entry_points(group=ENTRY_POINT_GROUP):
+            if entry in _BROKEN:
+                continue
+            try:
+                entry.load()
+            except (Exception, SystemExit) as error:
+                cause = str(error) if isinstance(error, TrihedronError) else f"{type(error).__name__}: {error}"
+                _BROKEN[entry] = printable(cause)
+                line = f"plugin package {_package_of(entry)}: does not load: {_BROKEN[entry]}; it is left out until you mend or uninstall it"
+                print(f"trihedron: warning: {line}", file=sys.stderr)
+
+
+def broken_packages() -> dict[str, str]:
+    """Return each installed package of plugins that does not load, with its module, and why; call `load_plugins` first."""
+    return {_package_of(entry): cause for entry, cause in _BROKEN.items()}
+
+
+def _package_of(entry: EntryPoint) -> str:
+    return f"{entry.dist.name if entry.dist else entry.name} ({entry.value})"

@@ -187,16 +187,35 @@ class Scheduler:
         self.kept.forget(position)
 
 
+class _ProcessSettings:
+    """Settings of the process, made by the first of several runs at once and undone by the last, in whatever order and thread they end."""
+
+    def __init__(self) -> None:
+        self._lock, self._users, self._undo = threading.Lock(), 0, contextlib.ExitStack()
+
+    def __enter__(self) -> None:
+        with self._lock:
+            self._users += 1
+            if self._users == 1:
+                self._undo.callback(cv2.setNumThreads, cv2.getNumThreads())
+                self._undo.callback(sys.setswitchinterval, sys.getswitchinterval())
+                cv2.setNumThreads(1)
+                sys.setswitchinterval(SWITCH_S)
+                self._undo.enter_context(threadpool_limits(1, user_api="blas"))
+
+    def __exit__(self, *error: object) -> None:
+        with self._lock:
+            self._users -= 1
+            if self._users == 0:
+                self._undo.close()
+
+
+_SETTINGS = _ProcessSettings()
+
+
 @contextlib.contextmanager
 def single_threaded_libraries() -> Iterator[None]:
     """One thread per library: the runner parallelises stages itself, and sums split over threads would change with their number. A thread that
     waits for the interpreter gets it after `SWITCH_S`: a stage returns from compiled code some hundred times a frame."""
-    before, switch_s = cv2.getNumThreads(), sys.getswitchinterval()
-    cv2.setNumThreads(1)
-    sys.setswitchinterval(SWITCH_S)
-    try:
-        with threadpool_limits(1):
-            yield
-    finally:
-        cv2.setNumThreads(before)
-        sys.setswitchinterval(switch_s)
+    with _SETTINGS, threadpool_limits(1, user_api="openmp"):  # OpenMP's is a setting of the calling thread
+        yield

@@ -35,10 +35,13 @@ class Frames:
         self._calibration = camera.calibration
         self._rectification = self._calibration.rectification
 
-    def __call__(self, index: int, stamp_ns: int, rgb: object | None, depth: object) -> Frame:
-        """Make frame `index` of rgb (h, w, 3) uint8, None for a black image, and depth (h, w), in metres or uint16 / depth_scale."""
-        color = self._color(rgb) if rgb is not None else np.zeros((self.camera.height, self.camera.width, 3), np.uint8)
-        color, depth_m = self._rectification.color(color), self._rectification.depth(self._depth(depth))
+    def __call__(self, index: int, stamp_ns: int, rgb: object | None, depth: object | None) -> Frame:
+        """Make frame `index` of rgb (h, w, 3) uint8 and depth (h, w), in metres or uint16 / depth_scale. None is a missing image: black, or without
+        readings, as frame validation replaces a faulty one."""
+        size = self.camera.height, self.camera.width
+        color = self._color(rgb) if rgb is not None else np.zeros((*size, 3), np.uint8)
+        depth_m = self._depth(depth) if depth is not None else np.zeros(size, np.float32)
+        color, depth_m = self._rectification.color(color), self._rectification.depth(depth_m)
         return Frame(index, stamp_ns, color, depth_m, self._calibration.camera)
 
     def _color(self, given: object) -> U8:

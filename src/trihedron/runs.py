@@ -64,7 +64,6 @@ def run(*overrides: str, out: str | Path | None = None, quiet: bool = False, **o
     Raises:
         UsageError: a word is no override, is of a sweep, or holds a value that no option takes.
         ConfigError: a key, plugin or option is unknown, an option out of range, or the folder cannot be written.
-        PluginError: an installed package of plugins does not load.
         GraphError: the wires of the graph do not fit together.
         DataError: the data set cannot be read, or another run writes to the folder.
         RecordingError: the recording to replay cannot be read, or lacks what the stages need.

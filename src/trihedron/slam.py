@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import atexit
 import copy
+import functools
 import json
 import threading
 import time
@@ -16,7 +17,7 @@ from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, Concatenate, ParamSpec, TypeVar
 
 from trihedron.buildings import Building
 from trihedron.camera import Camera
@@ -46,13 +47,31 @@ from trihedron.words import words_of
 
 REFUSED = ("replay", "only", "live", "real_time", "save_map", "sequences")  # root keys of a run that make no sense for pushed frames
 WARM_UP_PX = 640  # the largest width of the images of the warm-up
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def _of_one_thread(method: Callable[Concatenate[Slam, P], R]) -> Callable[Concatenate[Slam, P], R]:
+    """Refuse a call while another thread is within one (decorator): each would wait for the other's frame."""
+
+    @functools.wraps(method)
+    def call(self: Slam, /, *args: P.args, **kwargs: P.kwargs) -> R:
+        if not self._caller.acquire(blocking=False):
+            raise UsageError("Slam", "another thread is using it", "make one Slam for each thread, or hold a lock of your own around all calls")
+        try:
+            return method(self, *args, **kwargs)
+        finally:
+            self._caller.release()
+
+    return call
 
 
 class Slam:
     """Track a camera frame by frame.
 
-    Frames are pushed from one thread. Used as a context manager it is closed at the end of the block. Constructing compiles what is not compiled yet,
-    and a message names it. While it is open, OpenCV and BLAS use one thread in this process.
+    One thread at a time uses it, another gets an error at once; several threads may each have their own. Used as a context manager it is closed at
+    the end of the block. Constructing compiles what is not compiled yet, and a message names it. While one is open, OpenCV and BLAS use one thread in
+    this process.
 
     Args:
         camera: intrinsics of both images, which are registered; a camera file's distortion and unit of depth are applied.
@@ -65,7 +84,6 @@ class Slam:
         DataError: `camera` is none, or another run writes to the folder `out`.
         UsageError: a word is no override, or makes no sense for pushed frames, as that of a data set.
         ConfigError: a key, plugin or option is unknown, an option out of range, or the folder cannot be written.
-        PluginError: an installed package of plugins does not load.
         GraphError: the wires of the graph do not fit together.
 
     Examples:
@@ -95,7 +113,8 @@ class Slam:
         self._words = words
         graph = graph_of(self._config)
         self._queue = graph.stages["dataset"].plugin.queue
-        self._changed = threading.Condition()
+        self._caller, self._changed = threading.RLock(), threading.Condition()
+        self._closing = threading.Lock()
         self._values: dict[str, dict[int, Value | None]] = {name: {} for name in graph.stages}  # stage -> position -> value
         self._last = -1  # position of the last frame pushed
         self._settled = -1  # and of the last one with which all stages are done
@@ -140,13 +159,14 @@ class Slam:
         """The camera whose images are pushed."""
         return self._frames.camera
 
+    @_of_one_thread
     def track(self, rgb: Any, depth: Any, t: float) -> Any:
         """Track one frame and return its `Pose`; slow stages, such as bundle adjustment, may still work on it. A graph without the stage `pose`
         gives the value of its last stage.
 
         Args:
-            rgb: (h, w, 3) uint8, red first; copied.
-            depth: (h, w) float metres or uint16 divided by the camera's `depth_scale`, 0 where there is none; copied.
+            rgb: (h, w, 3) uint8, red first; copied. None: this frame has no colour image, and is tracked as one of a run whose colour is missing.
+            depth: (h, w) float metres or uint16 divided by the camera's `depth_scale`, 0 where there is none; copied. None: this frame has no depth.
             t: seconds, later than that of the frame before.
 
         Returns:
@@ -154,7 +174,7 @@ class Slam:
 
         Raises:
             DataError: an argument does not fit; it names it.
-            UsageError: the object is closed.
+            UsageError: the object is closed, or another thread is using it.
             StageError: a stage failed, at this frame or one before.
 
         Examples:
@@ -181,21 +201,24 @@ class Slam:
     @property
     def values(self) -> Values:
         """The values of the last frame by topic, as `slam.values["planes"]`; None where a stage wrote nothing."""
-        return Values(self._values, self._value)
+        return Values(self._values, self._read)
 
     @property
+    @_of_one_thread
     def map(self) -> Map | None:
         """The map after the last frame; None before there is one."""
         self._settle()
         return self._runner.result.map
 
     @property
+    @_of_one_thread
     def trajectory(self) -> Trajectory:
         """The poses of all tracked frames, relative to the keyframes of the map as it is now."""
         self._settle()
         return Trajectory.of(results.final_trajectory(self._runner.result))
 
     @property
+    @_of_one_thread
     def causal_trajectory(self) -> Trajectory:
         """The poses of all tracked frames as they were estimated at the time."""
         self._settle()
@@ -218,6 +241,7 @@ class Slam:
         """
         return Building(self._fold("building", preview=True))
 
+    @_of_one_thread
     def _fold(self, name: str, preview: bool = False) -> Any:
         """Return the result of a fold, or what it has so far: as a viewer sees it if `preview`, which is quicker."""
         if name not in self._values:
@@ -231,6 +255,7 @@ class Slam:
             )
         return finished
 
+    @_of_one_thread
     def save(self, path: str | Path) -> None:
         """Write a recording: all of it so far where frames are streamed to `out`; else all poses, the surface so far, and the images and values of
         the last `history` frames.
@@ -241,6 +266,7 @@ class Slam:
         Raises:
             RecordingError: the file cannot be written.
             DataError: it cannot be written, where frames are streamed to `out`.
+            UsageError: another thread is using the object.
         """
         self._settle()
         file = Path(path).expanduser()
@@ -254,6 +280,7 @@ class Slam:
         finally:
             writer.close()
 
+    @_of_one_thread
     def save_map(self, path: str | Path) -> None:
         """Write the map, to localise or to go on in it with `load_map=`.
 
@@ -267,14 +294,15 @@ class Slam:
         save_map(Path(path).expanduser(), self._runner.state, metadata_of(self._config, self._words), source_of(self._config))
 
     def close(self) -> None:
-        """End the run: finish the surface, and write the files of `out`. Closing twice does nothing.
+        """End the run: finish the surface, and write the files of `out`. Any thread may close it; closing twice does nothing.
 
         Raises:
             TrihedronError: a stage failed, or the recording could not be written.
         """
-        if self._closed:
-            return
-        self._closed = True
+        with self._closing:
+            if self._closed:
+                return
+            self._closed = True
         atexit.unregister(self.close)
         self._queue.close()
         self._thread.join()
@@ -325,6 +353,10 @@ class Slam:
                 self._changed.notify_all()
 
     # the caller's thread
+
+    @_of_one_thread
+    def _read(self, stage: str) -> Value | None:
+        return self._value(stage)
 
     def _value(self, stage: str) -> Value | None:
         """Wait until a stage is done with the last frame, and return its value."""

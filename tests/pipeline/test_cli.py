@@ -392,11 +392,41 @@ def test_the_plugin_package_of_the_readme_is_one_word_away(tmp_path):
     values = list(Recording("corners_run/run.mcap").values("keypoints"))
     assert len(values) == 12 and 20 < max(len(v.pixels) for v in values) <= 200
     (site / "trihedron_corners.py").write_text("import not_there")
-    done = trihedron("run", *SMALL)
-    assert (done.returncode, done.stderr.strip()) == (
-        1,
-        (
-            "trihedron: plugin package trihedron-corners (trihedron_corners): does not load: ModuleNotFoundError: "
-            "No module named 'not_there'; mend it or uninstall it"
-        ),
-    )
+    done = trihedron("run", *SMALL, "keypoints=shi_tomasi")
+    error = "ModuleNotFoundError: No module named 'not_there'"
+    assert done.returncode == 1
+    assert done.stderr.splitlines()[-1].endswith(f"it may be in trihedron-corners (trihedron_corners), which does not load: {error}")
+
+
+@pytest.mark.parametrize(
+    "module",
+    ["import not_there", "from trihedron import register\n\n\n@register('planes', 'mine')\nclass Mine: ..."],
+    ids=["lacks a library", "is no plugin"],
+)
+def test_a_broken_plugin_package_disables_only_itself(tmp_path, module):
+    """It breaks its slot's contract, or lacks a library: it is listed with its error, choosing it says why, and all else runs."""
+    (tmp_path / "mine.py").write_text(module)
+    info = tmp_path / "mine-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: mine\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[trihedron.plugins]\nmine = mine\n")
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])}
+    if module == "import not_there":
+        why = "ModuleNotFoundError: No module named 'not_there'"
+    else:
+        why = f"plugin planes=mine ({tmp_path / 'mine.py'}): is not a frozen dataclass; put @dataclass(frozen=True) under @register"
+
+    def called(*command):
+        return subprocess.run(command, env=environment, capture_output=True, text=True, cwd=tmp_path)
+
+    done = called(*PROGRAM, "plugins")
+    assert (done.returncode, done.stdout.splitlines()[-1]) == (0, f"broken: mine (mine) does not load: {why}; mend it or uninstall it")
+    warning = f"trihedron: warning: plugin package mine (mine): does not load: {why}; it is left out until you mend or uninstall it"
+    assert done.stderr.splitlines() == [warning]
+    done = called(sys.executable, "-c", "import trihedron as th; print(th.planes.cape().name); th.planes.mine()")
+    assert done.stdout == "cape\n"
+    assert done.stderr.splitlines()[-1].endswith(f"it may be in mine (mine), which does not load: {why}")
+    done = called(*PROGRAM, "run", *SMALL, "planes=mine")
+    assert done.returncode == 1 and done.stderr.splitlines()[-1].endswith(f"it may be in mine (mine), which does not load: {why}")
+    done = called(*PROGRAM, "plugins", "planes", "mine")
+    assert done.returncode == 2 and done.stderr.splitlines()[-1].endswith(f"it may be in mine (mine), which does not load: {why}")

@@ -121,15 +121,32 @@ def test_a_fold_needs_three_methods():
     assert register("surface", "mine")(Whole) is Whole
 
 
-def test_a_plugin_package_that_does_not_load_is_named(monkeypatch):
+def test_a_plugin_package_that_does_not_load_disables_only_itself(monkeypatch, capsys):
     class Entry:
         name, value, dist = "mine", "mine.plugins", None
 
         def load(self):
-            raise ImportError("No module named 'mine'")
+            raise self.error
 
-    monkeypatch.setattr(registry, "_BUILT_IN", ())
-    monkeypatch.setattr(registry, "entry_points", lambda group: [Entry()])
+    broken, exits, entries = Entry(), Entry(), []
+    broken.error, exits.error, exits.value = ImportError("No module named 'mine'"), SystemExit(3), "other"
+    loads = Entry()
+    loads.load = lambda: entries.append("loaded")
+    monkeypatch.setattr(registry, "_BROKEN", {})
+    monkeypatch.setattr(registry, "entry_points", lambda group: [broken, exits, loads])
+    registry.load_plugins()
+    registry.load_plugins()
+    assert entries == ["loaded", "loaded"]
+    assert capsys.readouterr().err.splitlines() == [  # once
+        "trihedron: warning: plugin package mine (mine.plugins): does not load: ImportError: No module named 'mine'; "
+        "it is left out until you mend or uninstall it",
+        "trihedron: warning: plugin package mine (other): does not load: SystemExit: 3; it is left out until you mend or uninstall it",
+    ]
+    register("keypoints", "mine")(Good)
     with pytest.raises(PluginError) as error:
-        registry.load_plugins()
-    assert str(error.value) == ("plugin package mine (mine.plugins): does not load: ImportError: No module named 'mine'; mend it or uninstall it")
+        registry.plugin_class("keypoints", "mime")
+    assert str(error.value) == (
+        "keypoints: there is no plugin 'mime' for the slot 'keypoints'; did you mean 'mine'?; "
+        "it may be in mine (mine.plugins), which does not load: ImportError: No module named 'mine'; "
+        "it may be in mine (other), which does not load: SystemExit: 3"
+    )

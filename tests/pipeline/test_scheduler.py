@@ -1,18 +1,21 @@
 """The scheduler: wires mean what they say, and neither thread count nor duration changes a value."""
 
 import random
+import sys
 import threading
 import time
 from types import SimpleNamespace
 
+import cv2
 import pytest
+from threadpoolctl import threadpool_info
 
 from trihedron.pipeline.core.wires import PREVIOUS, Wire
 from trihedron.pipeline.run import scheduler
 from trihedron.pipeline.run.kept_values import KeptValues
 from trihedron.pipeline.run.node import Node, NodeFailure, consumers_of, lagging_nodes
 from trihedron.pipeline.run.readiness import Readiness
-from trihedron.pipeline.run.scheduler import Scheduler
+from trihedron.pipeline.run.scheduler import Scheduler, single_threaded_libraries
 from trihedron.pipeline.run.task_order import ReadyTasks, TaskOrder
 
 NET_S = 120.0  # after which what waits for another thread fails: no measure of speed
@@ -238,3 +241,24 @@ def test_what_only_later_frames_read_may_lag():
     assert lagging_nodes(consumers_of(nodes)) == set() and lagging_nodes(consumers_of([CHAIN[0], Node("d", nodes[3].call, {"x": Wire("a", 3)})])) == {
         "a"
     }
+
+
+def test_libraries_get_their_threads_back_in_whatever_order_runs_end():
+    def settings():
+        return cv2.getNumThreads(), sys.getswitchinterval(), [pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"]
+
+    before = cv2.getNumThreads()
+    try:
+        cv2.setNumThreads(3)
+        own = settings()
+        first, second = single_threaded_libraries(), single_threaded_libraries()
+        first.__enter__()
+        within = settings()
+        assert within[0] == 1 and set(within[2]) <= {1}
+        second.__enter__()
+        first.__exit__(None, None, None)
+        assert settings() == within  # the second one still runs
+        second.__exit__(None, None, None)
+        assert settings() == own
+    finally:
+        cv2.setNumThreads(before)
