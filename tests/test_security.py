@@ -1,9 +1,12 @@
 """What SECURITY.md promises: no code from data, no file outside the data set's folder is read, none outside the run folder is written."""
 
 import ast
+import errno
 import json
 import os
 import re
+import subprocess
+import sys
 import tracemalloc
 from dataclasses import fields, replace
 from pathlib import Path
@@ -22,7 +25,7 @@ from trihedron.datasets.readers.tum import Tum
 from trihedron.pipeline.app.cli import main
 from trihedron.pipeline.core.config import compose_run
 from trihedron.pipeline.core.errors import DataError, RecordingError
-from trihedron.pipeline.core.files import read_file
+from trihedron.pipeline.core.files import new_file, read_file, write_file
 from trihedron.pipeline.core.slots import SLOTS
 from trihedron.pipeline.core.types import Camera, FrameReference, Pose
 from trihedron.pipeline.record.codec import FORMAT, METADATA
@@ -335,3 +338,85 @@ def test_numbers_of_another_program_beyond_any_place_are_refused(tmp_path):
     with pytest.raises(DataError) as caught:
         _kitti_poses(tmp_path / "far.txt", [(1, ["0"] * 12), (2, ["1e308"] * 12)])
     assert str(caught.value) == f"{tmp_path}/far.txt:2: a number is beyond 1e+09; each line holds the 12 numbers of a pose, metres"
+
+
+LINKED = ("run.mcap", "trajectory.txt", "trajectory_causal.txt", "metrics.json", "timing.json", "surface.ply")
+LINKED_BUILDING = ("building.json", "floorplan.svg", "floorplan.dxf", "building.glb")
+
+
+def plant_links(folder, names):
+    """Make links of these names in a folder, to files that are not the run's; return the files."""
+    folder.mkdir()
+    for name in names:
+        target = folder.parent / f"mine-{Path(name).name}"
+        target.write_text("mine")
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).symlink_to(target)
+    return sorted(folder.parent.glob("mine-*"))
+
+
+def test_a_run_writes_through_no_link(tmp_path):
+    """An archive may hold a run folder with links to files of whoever unpacks it and runs there again."""
+    mine = plant_links(tmp_path / "run", [*LINKED, *LINKED_BUILDING, "map.mcap", "map.mcap.part", ".hydra/config.yaml", ".hydra/overrides.yaml"])
+    words = ["dataset.width=160", "dataset.height=120", "dataset.length=4", f"out={tmp_path}/run", "outputs=[trajectory,surface,building]"]
+    assert main(["run", *words, f"save_map={tmp_path}/run/map.mcap"]) == 0
+    assert len(mine) == 14 and {path.read_text() for path in mine} == {"mine"}
+    links = [path.name for path in (tmp_path / "run").rglob("*") if path.is_symlink()]
+    assert links == ["map.mcap.part"]
+    assert not list((tmp_path / "run").glob(".trihedron-*"))
+    assert len(list(Recording(tmp_path / "run" / "run.mcap").values("pose"))) == 4
+
+
+def test_a_configuration_is_not_written_into_a_linked_folder(tmp_path, capsys):
+    (tmp_path / "run").mkdir()
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "run" / ".hydra").symlink_to(tmp_path / "mine")
+    assert main(["run", "dataset.length=4", f"out={tmp_path}/run"]) == 1
+    line = f"trihedron: out: the folder cannot be written: it is a link: {tmp_path}/run/.hydra; give another out=FOLDER\n"
+    assert capsys.readouterr().err == line and not list((tmp_path / "mine").iterdir())
+
+
+def test_a_recording_that_is_rewritten_follows_no_link(tmp_path):
+    """Neither the file nor one beside it whose name can be known: `recover` and `convert` wrote FILE.part before."""
+    seed = ROOT / "tests" / "fuzz" / "seeds" / "own.mcap"
+    mine = plant_links(tmp_path / "run", ["run.mcap.part", "run.part", "out.mcap", "new.mcap", "new.mcap.part"])
+    (tmp_path / "run" / "run.mcap").write_bytes(seed.read_bytes())
+    before = len(list(Recording(seed).values("frames")))
+    assert main(["recover", str(tmp_path / "run" / "run.mcap")]) == 0
+    assert main(["recover", str(seed), "--out", str(tmp_path / "run" / "out.mcap")]) == 0
+    older = ROOT / "tests" / "pipeline" / "recordings" / "format_5.mcap"
+    assert main(["convert", str(older), str(tmp_path / "run" / "new.mcap"), "--overwrite"]) == 0
+    for name in ("run.mcap", "out.mcap"):
+        assert len(list(Recording(tmp_path / "run" / name).values("frames"))) == before and not (tmp_path / "run" / name).is_symlink()
+    assert {path.read_text() for path in mine} == {"mine"}
+
+
+def test_a_result_is_whole_or_as_it_was(tmp_path):
+    """What fails while it is written leaves the file of before, and nothing beside it."""
+    path = tmp_path / "metrics.json"
+    path.write_text("before")
+    with pytest.raises(OSError, match="No space left") as caught, new_file(path) as new:
+        new.write_text("half")
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    assert caught.value.filename == str(path)
+    assert path.read_text() == "before" and list(tmp_path.iterdir()) == [path]
+    write_file(path, "after")
+    assert path.read_text() == "after" and list(tmp_path.iterdir()) == [path]
+    (tmp_path / "plain").touch()
+    assert path.stat().st_mode == (tmp_path / "plain").stat().st_mode
+
+
+def test_standard_output_is_written_not_replaced(tmp_path):
+    """/dev/stdout is a link: whoever may would replace it."""
+    code = "from pathlib import Path; from trihedron.pipeline.core.files import write_file; write_file(Path('/dev/stdout'), 'table')"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stdout == "table" and Path("/dev/stdout").is_symlink()
+    with pytest.raises(OSError, match="it is not a regular file: '/dev/null'"), new_file(Path("/dev/null")):
+        pass
+
+
+def test_a_pipe_in_the_place_of_a_recording_is_refused(tmp_path):
+    os.mkfifo(tmp_path / "run.mcap")
+    with pytest.raises(RecordingError) as caught:
+        RecordingWriter(tmp_path / "run.mcap", {})
+    assert str(caught.value) == f"{tmp_path}/run.mcap: cannot be written: it is not a regular file; give another out=FOLDER"

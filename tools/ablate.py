@@ -25,6 +25,7 @@ from pathlib import Path
 from trihedron.comparison import ablation_tables as tables
 from trihedron.comparison.ablation import ablate, known_cases, options_of, works_of
 from trihedron.comparison.preview import preview
+from trihedron.pipeline.core.files import write_file
 from trihedron.tools.arguments import Parser
 
 
@@ -47,7 +48,7 @@ def main(argv: list[str]) -> int:
     lines = tables.lines_of(found)
     print(tables.as_text(lines, sections))
     if given.markdown:
-        given.markdown.write_text(tables.as_markdown(lines, sections))
+        write_file(given.markdown, tables.as_markdown(lines, sections))
     if given.json:
-        given.json.write_text(json.dumps(tables.as_json(cases, found, sections), indent=2) + "\n")
+        write_file(given.json, json.dumps(tables.as_json(cases, found, sections), indent=2) + "\n")
     return 0

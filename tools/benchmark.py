@@ -36,6 +36,7 @@ from pathlib import Path
 from typing import Any
 
 from trihedron.pipeline.core.errors import UsageError, did_you_mean
+from trihedron.pipeline.core.files import write_file
 from trihedron.pipeline.core.layouts import data_set_words
 from trihedron.pipeline.core.types import U8
 from trihedron.tools.arguments import Parser
@@ -94,7 +95,7 @@ def main(argv: list[str]) -> int:
     if old is not None:
         print("\n" + comparison_table(old, figures))
     if options.json:
-        options.json.write_text(json.dumps(figures, indent=2) + "\n")
+        write_file(options.json, json.dumps(figures, indent=2) + "\n")
     return 0
 
 

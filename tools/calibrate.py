@@ -23,6 +23,7 @@ import yaml
 from trihedron.datasets.readers.cameras import Calibration, choose_calibration
 from trihedron.datasets.readers.registration import DepthCamera
 from trihedron.pipeline.core.errors import DataError
+from trihedron.pipeline.core.files import write_file
 from trihedron.pipeline.core.text_table import table
 from trihedron.pipeline.core.types import F64, Camera
 from trihedron.pipeline.record.reader import Recording
@@ -72,7 +73,7 @@ def main(argv: list[str]) -> int:
     if arguments.out is not None:
         if not used.depth_scale:
             raise DataError(str(recording.path), "is not of a data set with a camera file", "copy the lines that are printed")
-        arguments.out.write_text(yaml.safe_dump(keys_of(changed), sort_keys=False, default_flow_style=None))
+        write_file(arguments.out, yaml.safe_dump(keys_of(changed), sort_keys=False, default_flow_style=None))
     return 0
 
 

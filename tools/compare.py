@@ -23,6 +23,7 @@ from trihedron.comparison import run_tables as render
 from trihedron.comparison.run_samples import COLUMNS
 from trihedron.comparison.runs import judge_surfaces, read_runs, read_trajectories, rows_of, verdicts_against, with_verdicts
 from trihedron.comparison.verdicts import NOTE, VERDICTS, line_of
+from trihedron.pipeline.core.files import write_file
 from trihedron.tools.arguments import Parser
 
 
@@ -49,5 +50,5 @@ def main(argv: list[str]) -> int:
     print(render.as_text(rows))
     for name, write in render.WRITERS.items():
         if getattr(options, name):
-            getattr(options, name).write_text(write(rows, lines))
+            write_file(getattr(options, name), write(rows, lines))
     return 0

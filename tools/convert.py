@@ -77,6 +77,7 @@ def convert(dataset: str, options: dict[str, str | None], destination: Path) -> 
     Raises DataError when the data set cannot be read, ConfigError for options it does not have."""
     from trihedron.pipeline.core.graph import build_graph
     from trihedron.pipeline.core.registry import load_plugins, plugin_class
+    from trihedron.pipeline.record.mcap_writer import new_recording
     from trihedron.pipeline.record.trajectories import TRUTH, format_trajectory
     from trihedron.pipeline.record.writer import RecordingWriter
     from trihedron.pipeline.run.runner import Runner
@@ -85,15 +86,11 @@ def convert(dataset: str, options: dict[str, str | None], destination: Path) -> 
     plugin = _plugin(plugin_class("dataset", dataset), dataset, options)
     runner = Runner(build_graph({"dataset": plugin}, ["dataset"]), frames=options["frames"] or "")
     truth = plugin.truth()
-    unfinished = destination.with_suffix(".part")
-    try:
-        writer = RecordingWriter(unfinished, _metadata(destination))
+    with new_recording(destination, "give another DST.mcap") as new:
+        writer = RecordingWriter(new, _metadata(destination))
         if truth is not None:
             writer.attach(TRUTH, format_trajectory(truth))
         _write(runner, writer)
-        unfinished.replace(destination)
-    finally:
-        unfinished.unlink(missing_ok=True)
     return len(runner.result.stamps_ns), runner.result.unreadable
 
 

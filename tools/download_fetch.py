@@ -14,6 +14,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from trihedron.pipeline.core.errors import DataError, printable
+from trihedron.pipeline.core.files import write_file
 
 PINS = "pins.json"
 CHUNK = 1 << 14  # what a broken connection loses at most
@@ -75,7 +76,7 @@ class Cache:
         pins = self._pins()
         pins[archive.address] = {"sha256": archive.sha256, "bytes": archive.path.stat().st_size, "first": str(date.today())}
         written = self.folder / f"{PINS}.new"
-        written.write_text(json.dumps(pins, indent=2, sort_keys=True) + "\n")
+        write_file(written, json.dumps(pins, indent=2, sort_keys=True) + "\n")
         written.replace(self.folder / PINS)
 
     def discard(self, archive: Archive) -> None:
@@ -161,10 +162,10 @@ class _Download:
         total = have + int(length) if length.isdigit() else None
         if total is not None and total > self.limit:
             raise _too_large(url, total, self.limit)
-        self._validator.write_text(response.headers.get("ETag") or response.headers.get("Last-Modified") or "")
+        write_file(self._validator, response.headers.get("ETag") or response.headers.get("Last-Modified") or "")
         bar = tqdm(total=total, initial=have, unit="B", unit_scale=True, desc=_file_name(url)[:30], disable=None, file=sys.stderr)
         broken = ""
-        with open(self.part, "ab") as file, bar:
+        with open(self.part, "ab", opener=_unlinked) as file, bar:
             try:
                 for chunk in response.iter_content(CHUNK):
                     have += len(chunk)
@@ -181,6 +182,11 @@ class _Download:
         if broken or (total is not None and have < total):
             of = f" of {total / 1e6:.1f}" if total is not None else ""
             raise DataError(url, f"the download was interrupted after {have / 1e6:.1f}{of} MB", "the same command again goes on from there")
+
+
+def _unlinked(path: str, flags: int) -> int:
+    """Open a file itself, not what a link in its place names."""
+    return os.open(path, flags | os.O_NOFOLLOW, 0o666)
 
 
 def _too_large(place: str, size: int, limit: int) -> DataError:

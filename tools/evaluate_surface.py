@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from trihedron.comparison.surface_errors import FIGURES, RECORDING, SURFACE, WITHIN_M, evaluate_files
+from trihedron.pipeline.core.files import write_file
 from trihedron.pipeline.core.text_table import table
 from trihedron.tools.arguments import Parser
 
@@ -33,7 +34,7 @@ def main(argv: list[str]) -> int:
     truth: Path = arguments.truth or mesh.parent
     figures = evaluate_files(mesh, truth / RECORDING if truth.is_dir() else truth)
     if arguments.mesh.is_dir() and arguments.truth is None:
-        (arguments.mesh / FIGURES).write_text(json.dumps(figures, indent=2) + "\n")
+        write_file(arguments.mesh / FIGURES, json.dumps(figures, indent=2) + "\n")
     print(json.dumps(figures, indent=2) if arguments.json else report(figures))
     return 0
 

@@ -5,6 +5,7 @@ first pixel at (0.5, 0.5), we at (0, 0)."""
 
 from __future__ import annotations
 
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import numpy as np
 
 from trihedron.pipeline.app.recorded_values import frames_of, last_map, references_of
 from trihedron.pipeline.core.errors import DataError
+from trihedron.pipeline.core.files import make_folder, write_file
 from trihedron.pipeline.core.geometry import invert
 from trihedron.pipeline.core.libraries import imports_of
 from trihedron.pipeline.core.types import I32, U8, FrameReference, Map
@@ -33,8 +35,9 @@ def write_colmap(recording: Recording, path: Path) -> str:
         raise DataError(str(recording.path), "holds no keyframes", "record a run with a map")
     model, references, at = pycolmap.Reconstruction(), references_of(recording), frames_of(recording)
     folders = path / "images", path / "sparse" / "0"
-    for folder in folders:
-        folder.mkdir(parents=True, exist_ok=True)
+    path.mkdir(parents=True, exist_ok=True)
+    for folder in (folders[0], folders[1].parent, folders[1]):
+        make_folder(folder)
     seen = _observations(map, rows)
     colors = np.full((len(map.points), 3), 128, np.uint8)
     first = references[int(map.keyframes.column("index")[rows[0]])].camera
@@ -50,8 +53,11 @@ def write_colmap(recording: Recording, path: Path) -> str:
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose))
     _add_points(model, map, rows, seen, colors)
     model.update_point_3d_errors()
-    model.write_binary(str(folders[1]))
-    model.write_text(str(folders[1]))
+    with tempfile.TemporaryDirectory() as written:
+        model.write_binary(written)
+        model.write_text(written)
+        for file in Path(written).iterdir():
+            write_file(folders[1] / file.name, file.read_bytes())
     return f"{model.num_images()} images, {model.num_points3D()} points with {model.compute_num_observations()} observations"
 
 
@@ -76,7 +82,7 @@ def _save(path: Path, at: Any, reference: FrameReference, colors: U8, points: An
     frame = at(reference)
     if frame is None:
         raise DataError(str(path), f"frame {reference.index} cannot be read", "record with record.frames=true")
-    path.write_bytes(bytes(cv2.imencode(".png", frame.color[..., ::-1])[1]))
+    write_file(path, bytes(cv2.imencode(".png", frame.color[..., ::-1])[1]))
     colors[points] = colors_at(frame.color, pixels)
 
 

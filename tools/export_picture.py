@@ -12,6 +12,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from trihedron.pipeline.core.files import write_file
 from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F32, F64, I32, PLANE_KINDS, U8, Bool, Surface
 from trihedron.pipeline.record.reader import Recording
@@ -41,7 +42,7 @@ PALETTE = np.array(
 def write_picture(recording: Recording, path: Path) -> str:
     """PNG: two views beside or above each other, whichever is larger."""
     picture, count = draw_surface(surface_of(recording))
-    path.write_bytes(bytes(cv2.imencode(".png", picture[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9])[1]))
+    write_file(path, bytes(cv2.imencode(".png", picture[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9])[1]))
     size = f"{picture.shape[1]} × {picture.shape[0]} px"
     return f"{size}, {count} triangles below the ceiling, as they were seen and by planes" if count else f"{size}, empty: no surface"
 

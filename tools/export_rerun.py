@@ -11,6 +11,7 @@ from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 
 from trihedron.pipeline.app.recorded_values import references_of
 from trihedron.pipeline.core.errors import DataError
+from trihedron.pipeline.core.files import new_file
 from trihedron.pipeline.core.registry import load_plugins
 from trihedron.pipeline.record.foxglove import TopicView
 from trihedron.pipeline.record.reader import Recording
@@ -26,9 +27,10 @@ def write_rerun(recording: Recording, path: Path) -> str:
     """RRD: what `trihedron view` shows."""
     rerun = require_rerun()
     stream = rerun.RecordingStream("trihedron")
-    stream.save(path, default_blueprint=blueprint())
-    count = show(recording, stream)
-    stream.flush()
+    with new_file(path) as new:
+        stream.save(new, default_blueprint=blueprint())
+        count = show(recording, stream)
+        stream.flush()
     return f"{count} frames; open it with: rerun {path}"
 
 

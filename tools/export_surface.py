@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from trihedron.pipeline.core.errors import DataError
+from trihedron.pipeline.core.files import write_file
 from trihedron.pipeline.core.types import F64, PLANE_KINDS, Surface
 from trihedron.pipeline.record.reader import Recording
 from trihedron.plugins.surface.ply import triangle_planes, write_ply
@@ -65,7 +66,7 @@ def write_obj(recording: Recording, path: Path) -> str:
     surface = surface_of(recording)
     scene = _scene(surface, upright(surface.up), textured=False)
     header = "metres; z up; x right and y ahead of the first camera"
-    path.write_text(scene.export(file_type="obj", header=header, digits=5, include_normals=False) if scene.geometry else f"# {header}\n")
+    write_file(path, scene.export(file_type="obj", header=header, digits=5, include_normals=False) if scene.geometry else f"# {header}\n")
     return _summary(surface)
 
 
@@ -75,7 +76,7 @@ def write_gltf(recording: Recording, path: Path) -> str:
 
     surface = surface_of(recording)
     scene = _scene(surface, upright(surface.up, "y"), textured=True)
-    path.write_bytes(export_glb(scene, tree_postprocessor=_finish_gltf))
+    write_file(path, export_glb(scene, tree_postprocessor=_finish_gltf))
     return _summary(surface)
 
 
@@ -136,7 +137,7 @@ def write_planes(recording: Recording, path: Path) -> str:
         loops = [vertices[surface.loop_vertices[a:b]] for p, a, b in surface.loops if p == plane]
         planes.append({**_facts(surface, plane, R), "boundary": [np.round(loop, 5).tolist() for loop in loops]})
     content = {"unit": "m", "up": [0, 0, 1], "R_file_world": R.tolist(), "planes": planes}
-    path.write_text(json.dumps(content, indent=1) + "\n")
+    write_file(path, json.dumps(content, indent=1) + "\n")
     return _summary(surface)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 
 from trihedron.pipeline.app.recorded_values import poses_of, trajectory_of
 from trihedron.pipeline.core.errors import DataError
+from trihedron.pipeline.core.files import write_file
 from trihedron.pipeline.core.geometry import quaternion_from_rotation
 from trihedron.pipeline.core.types import Pose, Trajectory
 from trihedron.pipeline.record.codec import TIMING_TOPIC, timing_of
@@ -52,13 +54,14 @@ def write_covariances(path: Path, poses: list[Pose]) -> None:
     """Write a row for each pose, its stamp and the lower triangle of `Pose.covariance`, row by row: 22 numbers. That is the convention of smfeval:
     perturbation on the right, so in the camera frame, translation first, m and rad."""
     rows = (" ".join([format_stamp(pose.stamp_ns), *(f"{value:.12e}" for value in pose.covariance[np.tril_indices(6)])]) for pose in poses)
-    path.write_text("\n".join([*CONVENTION, *rows]) + "\n", encoding="utf-8")
+    write_file(path, "\n".join([*CONVENTION, *rows]) + "\n")
 
 
 def write_kitti(recording: Recording, path: Path) -> str:
     """Twelve numbers a row: the upper three rows of `T_world_camera`. The format has no stamps, so rows are the tracked frames in order."""
     trajectory = trajectory_of(recording)
-    np.savetxt(path, trajectory.poses[:, :3].reshape(-1, 12), fmt="%.9e")
+    np.savetxt(text := io.StringIO(), trajectory.poses[:, :3].reshape(-1, 12), fmt="%.9e")
+    write_file(path, text.getvalue())
     return f"{len(trajectory)} poses, without stamps; frames that were lost have no row"
 
 
@@ -74,10 +77,10 @@ def write_csv(recording: Recording, path: Path) -> str:
         if timing["index"] in columns:
             columns[timing["index"]] |= {"frame_ms": timing["frame_ms"], **{f"ms_{stage}": ms for stage, ms in timing["stage_ms"].items()}}
     names = list(dict.fromkeys(name for row in columns.values() for name in row))
-    with open(path, "w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, names, restval="")
-        writer.writeheader()
-        writer.writerows(columns.values())
+    writer = csv.DictWriter(text := io.StringIO(newline=""), names, restval="")
+    writer.writeheader()
+    writer.writerows(columns.values())
+    write_file(path, text.getvalue())
     return f"{len(columns)} frames, {len(names)} columns"
 
 

@@ -26,6 +26,7 @@ from trihedron.comparison.attribution import nees_of
 from trihedron.comparison.fold_measures import Measures
 from trihedron.comparison.runs import judge_surfaces, run_folders
 from trihedron.pipeline.core.errors import DataError, TrihedronError
+from trihedron.pipeline.core.files import write_file
 from trihedron.pipeline.core.text_table import table
 from trihedron.pipeline.run.results import METRICS, TIMING
 from trihedron.pipeline.sweep.sweep import GRAPH_KEYS, is_graph_word
@@ -55,7 +56,7 @@ def main(argv: list[str]) -> int:
         detectors = json.loads(options.detectors.read_text()) if options.detectors else {}
         options.json.parent.mkdir(parents=True, exist_ok=True)
         lines = ",\n".join(json.dumps(row) for row in rows)
-        options.json.write_text(f'{{"detectors": {json.dumps(detectors)},\n"runs": [\n{lines}\n]}}\n')
+        write_file(options.json, f'{{"detectors": {json.dumps(detectors)},\n"runs": [\n{lines}\n]}}\n')
     return 1 if failures or any(row["note"] for row in rows) else 0
 
 

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, get_type_hints
 
 from trihedron.pipeline.core.errors import DataError, UsageError, did_you_mean
+from trihedron.pipeline.core.files import write_file
 from trihedron.tools.arguments import Parser
 
 WIDE = 6  # arguments that fit into one line
@@ -128,7 +129,7 @@ def main(argv: list[str]) -> int:
         raise DataError(str(folder), "is there already", "give another --out FOLDER")
     folder.mkdir(parents=True)
     for file, text in files.items():
-        (folder / file).write_text(text, encoding="utf-8")
+        write_file(folder / file, text)
         print(f"  {folder / file}")
     print(f"pip install -e {folder} && trihedron check {slot} {name} && trihedron run {slot}={name}")
     return 0

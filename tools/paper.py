@@ -19,6 +19,7 @@ import numpy as np
 from trihedron.comparison.run_tables import COMPARED, figure_text
 from trihedron.comparison.runs import groups_of, judge_surfaces, read_runs, row_of
 from trihedron.pipeline.core.errors import DataError, RecordingError
+from trihedron.pipeline.core.files import write_file
 from trihedron.pipeline.core.geometry import invert
 from trihedron.pipeline.core.text_table import table
 from trihedron.pipeline.record.reader import Recording
@@ -71,7 +72,7 @@ def main(argv: list[str]) -> int:
     tables = tables_of(known_of(options.folders))
     print("\n\n".join(found.as_text() for found in tables))
     if options.markdown:
-        options.markdown.write_text("\n".join(found.as_markdown() for found in tables), encoding="utf-8")
+        write_file(options.markdown, "\n".join(found.as_markdown() for found in tables))
     return 0
 
 

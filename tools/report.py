@@ -17,6 +17,7 @@ from typing import Any
 from trihedron.comparison import run_tables
 from trihedron.comparison.runs import Run, read_runs, rows_of
 from trihedron.pipeline.core.errors import DataError, TrihedronError
+from trihedron.pipeline.core.files import write_file
 from trihedron.pipeline.run.result_files import read_results
 from trihedron.pipeline.run.results import flatten_dict
 from trihedron.pipeline.run.stated_sigma import CAUSES, dominant_cause
@@ -36,7 +37,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--title", metavar="TEXT", help="default: the data set and the names of the runs")
     options = parser.parse_args(argv)
     runs = [run for folder in options.folders for run in read_runs(folder)]
-    options.out.write_text(page(runs, options.title), encoding="utf-8")
+    write_file(options.out, page(runs, options.title))
     print(options.out)
     return 0
 

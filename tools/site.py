@@ -21,7 +21,7 @@ import yaml
 from trihedron.comparison.run_tables import COMPARED, FIGURES, TRACKED, figure_text
 from trihedron.comparison.runs import Run, groups_of, read_runs, row_of
 from trihedron.pipeline.core.errors import DataError
-from trihedron.pipeline.core.files import MAX_YAML_BYTES, YamlError, parse_yaml, read_text
+from trihedron.pipeline.core.files import MAX_YAML_BYTES, YamlError, make_folder, parse_yaml, read_text, write_file
 from trihedron.tools import published
 from trihedron.tools.arguments import Parser
 from trihedron.tools.pages import render
@@ -79,7 +79,7 @@ def main(argv: list[str]) -> int:
     outside = band_failures(read_band(options.check), cells) if options.check else {}
     write_site(cells, options.out, options.title, outside, not options.no_pictures, ablations_of(options.folders))
     if options.write_band:
-        options.write_band.write_text(yaml.safe_dump(band_of(cells), sort_keys=False, allow_unicode=True))
+        write_file(options.write_band, yaml.safe_dump(band_of(cells), sort_keys=False, allow_unicode=True))
     print(options.out / "index.html")
     for failure in outside.values():
         print(f"outside its band: {failure}")
@@ -137,7 +137,8 @@ def write_site(
     """Write index.html and a page for each run and each ablation into a folder."""
     from trihedron.tools.paper import tables_of
 
-    (out / "runs").mkdir(parents=True, exist_ok=True)
+    out.mkdir(parents=True, exist_ok=True)
+    make_folder(out / "runs")
     commits = Counter(facts.commit for cell in cells for facts in cell.facts if facts.commit)
     commit = commits.most_common(1)[0][0] if commits else ""
     names = _page_names(cells)
@@ -145,10 +146,10 @@ def write_site(
     for cell in cells:
         for facts in cell.facts:
             page = run_page(facts, f"{_system(cell)}, {_data_title(cell)}", facts.commit != commit, pictures)
-            (out / "runs" / f"{names[facts.run.folder]}.html").write_text(page, encoding="utf-8")
+            write_file(out / "runs" / f"{names[facts.run.folder]}.html", page)
     for ablation in ablations:
-        (out / "ablations").mkdir(exist_ok=True)
-        (out / "ablations" / f"{ablation.name}.html").write_text(ablation_page(ablation, pictures), encoding="utf-8")
+        make_folder(out / "ablations")
+        write_file(out / "ablations" / f"{ablation.name}.html", ablation_page(ablation, pictures))
     groups = [_group(data, [cell for cell in cells if cell.data == data], columns, names, commit, outside or {}) for data in _data_of(cells)]
     page = render(
         "index.html",
@@ -164,7 +165,7 @@ def write_site(
         columns=columns,
         sources=[f"{published.paper()['source']}; {published.paper()['machine']}", f"{published.peers()['source']}; {published.peers()['machine']}"],
     )
-    (out / "index.html").write_text(page, encoding="utf-8")
+    write_file(out / "index.html", page)
 
 
 def _made_by(cells: Sequence[Cell], commit: str) -> str:

@@ -316,6 +316,7 @@ def _task(config: DictConfig) -> float | None:
 
 def _job(config: DictConfig, out: Path, work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
     """Do the work of a job, keeping what it prints in its folder, and how it ended in job.json."""
+    from trihedron.pipeline.core.files import open_anew
     from trihedron.pipeline.core.registry import load_plugins
     from trihedron.pipeline.sweep.jobs import DONE, FAILED, RUNNING, key_of, write_job
 
@@ -323,7 +324,7 @@ def _job(config: DictConfig, out: Path, work: Callable[[], dict[str, Any]]) -> d
     key = key_of(config)
     write_job(out, key, RUNNING)
     try:
-        with (out / "log.txt").open("w") as log, redirect_stdout(log), redirect_stderr(log):
+        with open_anew(out / "log.txt") as log, redirect_stdout(log), redirect_stderr(log):
             metrics = work()
     except Exception as error:
         write_job(out, key, FAILED, str(error) or type(error).__name__)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trihedron.pipeline.core.errors import DataError
+from trihedron.pipeline.core.files import new_file
 from trihedron.pipeline.core.geometry import nearest_rotation, transform, umeyama
 from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import DEGRADED, F64, LOST, Trajectory
@@ -37,7 +38,8 @@ def trajectory_figure(estimate: Trajectory, truth: Trajectory | None, path: Path
     else:
         _without_truth(figure, estimate, status)
     try:
-        figure.savefig(path, dpi=100)
+        with new_file(path) as new:
+            figure.savefig(new, dpi=100)
     except OSError as error:
         raise DataError(str(path), f"cannot be written: {error.strerror}", "give another folder") from error
 

@@ -1,4 +1,6 @@
-"""Files that come from anyone, read within bounds: regular files of limited size, YAML of limited depth, one line for whatever goes wrong."""
+"""Files that come from anyone, read within bounds: regular files of limited size, YAML of limited depth, one line for whatever goes wrong.
+
+Files of results are written whole or not at all, and never through what lies in their place: a folder may be a stranger's, with links in it."""
 
 from __future__ import annotations
 
@@ -6,10 +8,11 @@ import errno
 import hashlib
 import os
 import stat
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import IO, Any, BinaryIO
 
 import yaml
 
@@ -19,6 +22,7 @@ MAX_NETWORK_BYTES = 2**31  # of an ONNX file, as its format has it
 MAX_YAML_BYTES = 1_000_000
 MAX_YAML_DEPTH = 20  # of nested lists and mappings
 SHOWN = 60  # characters of a stranger's text in a message
+STREAMS = (Path("/dev"), Path("/dev/fd"), Path("/proc/self/fd"))  # folders of devices and open files, which nothing may replace
 
 
 def open_file(path: Path) -> BinaryIO:
@@ -44,6 +48,48 @@ def read_file(path: Path, limit: int) -> bytes:
     if data is None or len(data) > limit:
         raise OSError(errno.EFBIG, f"it has more than {limit} bytes")
     return data
+
+
+@contextmanager
+def new_file(path: Path) -> Iterator[Path]:
+    """Lend the path of a file that does not exist yet, for the block to write; it takes the place of `path` after the block, and vanishes if that
+    raises. It has the name of `path`, in a folder beside it that belongs to this process. Raises OSError, which names `path`."""
+    try:
+        if _is_stream(path):
+            raise OSError(errno.EINVAL, "it is not a regular file")
+        with tempfile.TemporaryDirectory(prefix=".trihedron-", dir=path.parent) as folder:
+            yield (new := Path(folder) / path.name)
+            os.replace(new, path)
+    except OSError as error:
+        error.filename, error.filename2 = str(path), None
+        raise
+
+
+def write_file(path: Path, content: str | bytes) -> None:
+    """Write a file, whole or not at all, or to /dev/stdout and the like; text as UTF-8, with ? for what is none. Raises OSError."""
+    data = content.encode(errors="replace") if isinstance(content, str) else content
+    if _is_stream(path):
+        path.write_bytes(data)
+    else:
+        with new_file(path) as new:
+            new.write_bytes(data)
+
+
+def _is_stream(path: Path) -> bool:
+    return path.absolute().parent in STREAMS
+
+
+def make_folder(path: Path) -> None:
+    """Make a folder in one that exists, unless it is there. Raises OSError, for a link in its place too."""
+    path.mkdir(exist_ok=True)
+    if path.is_symlink():
+        raise OSError(errno.ENOTDIR, "it is a link", str(path))
+
+
+def open_anew(path: Path) -> IO[str]:
+    """Open a text file that grows while it is read, in the place of whatever lies there. Raises OSError."""
+    path.unlink(missing_ok=True)
+    return open(path, "x", encoding="utf-8")
 
 
 def file_sha256(path: Path) -> str:

@@ -12,13 +12,15 @@ import os
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import foxglove
 from foxglove.mcap import MCAPWriteOptions
 
 from trihedron.pipeline.core.errors import RecordingError
+from trihedron.pipeline.core.files import new_file, open_file
 from trihedron.pipeline.record.foxglove_server import FoxgloveServer
 from trihedron.pipeline.record.mcap_file import is_being_written
 
@@ -30,6 +32,19 @@ LIVE_SECONDS = 0.03  # between two looks at the queue where a viewer waits
 LEVEL = 1  # of zstd: 2 takes a quarter more time for 7 % fewer bytes
 MESSAGE_OVERHEAD = 64  # bytes of a message beside its data, generously
 MAX_QUEUE_BYTES = 64 << 20  # a run that is faster than the disk waits from there on
+
+
+@contextmanager
+def new_recording(path: Path, cure: str) -> Iterator[Path]:
+    """Lend the path of a recording for the block to write and close, as `new_file` does. Raises RecordingError, which names `path`."""
+    new = path
+    try:
+        with new_file(path) as new:
+            yield new
+    except OSError as error:
+        raise RecordingError(str(path), f"cannot be written: {error.strerror}", cure) from error
+    except RecordingError as error:
+        raise error if error.place != str(new) else RecordingError(str(path), error.cause, cure) from error
 
 
 class McapWriter:
@@ -161,18 +176,20 @@ class _File:
     error of the disk is kept in `failure`, and everything later dropped."""
 
     def __init__(self, path: Path) -> None:
-        """Empty the file and lock it for this process. Raises RecordingError."""
+        """Make the file, in the place of whatever lies there, and lock it for this process. Raises RecordingError."""
         self.path, self._position = path, 0
         self.failure: OSError | None = None
         try:
-            self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+            if path.exists() and not path.is_symlink():
+                with open_file(path) as older:
+                    if is_being_written(older.fileno()):
+                        cure = "wait until that has ended, or give another out=FOLDER"
+                        raise RecordingError(str(path), "is being written by another process", cure)
+            path.unlink(missing_ok=True)
+            self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
         except OSError as error:
             raise RecordingError(str(path), f"cannot be written: {error.strerror}", "give another out=FOLDER") from error
-        if is_being_written(self._descriptor):
-            os.close(self._descriptor)
-            raise RecordingError(str(path), "is being written by another process", "wait until that has ended, or give another out=FOLDER")
-        if os.fstat(self._descriptor).st_size:  # a device has no size, and refuses
-            os.ftruncate(self._descriptor, 0)
+        is_being_written(self._descriptor)  # the lock
 
     def write(self, data: bytes | bytearray) -> int:
         rest = memoryview(data)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
@@ -12,7 +11,7 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
 from trihedron.pipeline.core.errors import DataError, RecordingError
-from trihedron.pipeline.core.files import open_file
+from trihedron.pipeline.core.files import new_file, open_file
 from trihedron.pipeline.record.mcap_file import chunk_records, damaged_file_error, is_being_written, max_plain_bytes
 
 CHUNK_BYTES = 4 << 20
@@ -44,7 +43,6 @@ class Rescued:
 def recover(path: Path, out: Path, being_written: bool = False) -> Rescued:
     """Write the whole records of the file `path` to `out`, which may be the same; of a file that is being written those so far, if that is allowed.
     Raises RecordingError for a file that is missing, in use or no MCAP, DataError where nothing can be written."""
-    partial = out.with_name(out.name + ".part")
     try:
         source = open_file(path)
     except OSError as error:
@@ -54,11 +52,9 @@ def recover(path: Path, out: Path, being_written: bool = False) -> Rescued:
             raise damaged_file_error(path)
         source.seek(0)
         try:
-            with open(partial, "wb") as file:
+            with new_file(out) as new, open(new, "wb") as file:
                 found = _copy(source, path.stat().st_size, file)
-            os.replace(partial, out)
         except OSError as error:
-            partial.unlink(missing_ok=True)
             raise DataError(str(out), f"cannot be written: {error.strerror}", "give another --out") from error
     return found
 

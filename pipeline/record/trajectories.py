@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from trihedron.pipeline.core.errors import DataError, printable
-from trihedron.pipeline.core.files import SHOWN, read_text
+from trihedron.pipeline.core.files import SHOWN, read_text, write_file
 from trihedron.pipeline.core.geometry import pose_matrix, quaternion_from_rotation, rotation_from_quaternion
 from trihedron.pipeline.core.types import F64, Trajectory
 
@@ -110,7 +110,7 @@ def attached_truth(attachments: Mapping[str, str], source: str) -> Trajectory | 
 
 def write_trajectory(path: str | Path, trajectory: Trajectory) -> None:
     """Write a trajectory so that `read_trajectory` gives it back: stamps exactly, positions to 1e-9 m."""
-    Path(path).expanduser().write_text(format_trajectory(trajectory), encoding="utf-8")
+    write_file(Path(path).expanduser(), format_trajectory(trajectory))
 
 
 def format_trajectory(trajectory: Trajectory) -> str:

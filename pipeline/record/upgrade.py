@@ -30,7 +30,7 @@ from trihedron.pipeline.record.codec import (
 )
 from trihedron.pipeline.record.embedded_images import messages_of
 from trihedron.pipeline.record.mcap_file import McapFile, damaged_file_error
-from trihedron.pipeline.record.mcap_writer import McapWriter
+from trihedron.pipeline.record.mcap_writer import McapWriter, new_recording
 from trihedron.pipeline.record.schemas import PACKAGE, definition, message_class
 
 RENAMED_TYPES: dict[str, str] = {}  # name in an older recording -> name today, where only the name changed
@@ -85,16 +85,12 @@ def upgrade(source: Path, destination: Path) -> Upgraded:
     result = Upgraded(skipped={file.channels[channel].topic: why for channel, why in unreadable.items()})
     if f"/{FRAMES_TOPIC}" in result.skipped:
         raise RecordingError(str(source), f"cannot be upgraded: {result.skipped[f'/{FRAMES_TOPIC}']}", "record it again")
-    partial = destination.with_name(destination.name + ".part")
-    try:
-        writer = McapWriter(partial)
+    with new_recording(destination, "give another DST.mcap") as new:
+        writer = McapWriter(new)
         try:
             _copy(file, writer, unreadable, result)
         finally:
             writer.close()
-        partial.replace(destination)
-    finally:
-        partial.unlink(missing_ok=True)
     return result
 
 

@@ -8,7 +8,6 @@ directions of its axes: its camera is lost until it is recognised.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,6 +16,7 @@ import numpy as np
 
 from trihedron.pipeline.core.errors import RecordingError
 from trihedron.pipeline.core.types import LOST, Map, Pose, Rotation, Value
+from trihedron.pipeline.record.mcap_writer import new_recording
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.writer import RecordingWriter
 from trihedron.pipeline.run.state import DelayLines, StateBuffer
@@ -62,20 +62,15 @@ def save_map(path: Path, state: StateBuffer, metadata: Mapping[str, str], source
     """Write the state of a run, whole or not at all. Raises RecordingError when there is no map or the file cannot be written."""
     if not state.values.get("map"):
         raise RecordingError(str(path), "cannot be saved: the run made no map", "choose a graph with a map")
-    partial = path.with_name(path.name + ".part")
     described = {"kind": "map", "map_version": MAP_VERSION, "frame": str(state.frame), "source": source}
-    try:
-        writer = RecordingWriter(partial, {**metadata, **described})
+    with new_recording(path, "give another save_map=FILE.mcap") as new:
+        writer = RecordingWriter(new, {**metadata, **described})
         try:
             for topic in sorted(state.values):
                 for value in state.values[topic].values():
                     writer.write(topic, value)
         finally:
             writer.close()
-    except RecordingError as error:
-        partial.unlink(missing_ok=True)
-        raise RecordingError(str(path), error.cause, "give another save_map=FILE.mcap") from error
-    os.replace(partial, path)
 
 
 def load_map(path: str) -> SavedMap:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from trihedron.pipeline.core.errors import DataError
+from trihedron.pipeline.core.files import write_file
 from trihedron.pipeline.core.linalg import matmul, norm
 from trihedron.pipeline.core.types import DEGRADED, LOST, OK, Map, Pose, Trajectory
 from trihedron.pipeline.record.trajectories import write_trajectory
@@ -110,7 +111,7 @@ def _consistency(result: Result, truth: Trajectory) -> dict[str, Any]:
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
     """Write a dictionary as indented JSON."""
-    path.write_text(json.dumps(content, indent=2) + "\n")
+    write_file(path, json.dumps(content, indent=2) + "\n")
 
 
 def flatten_dict(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -12,6 +12,7 @@ import yaml
 from omegaconf import DictConfig, OmegaConf
 
 from trihedron.pipeline.core.errors import ConfigError, DataError
+from trihedron.pipeline.core.files import make_folder, write_file
 
 CONFIG = ".hydra"  # folder of the composed configuration and the words it was composed of
 CURE = "give another out=FOLDER"
@@ -46,8 +47,8 @@ def _lock(descriptor: int, folder: Path) -> None:
 def write_configuration(folder: Path, config: DictConfig, words: Sequence[str]) -> None:
     """Write the composed configuration and the words of the command. Raises ConfigError."""
     try:
-        (folder / CONFIG).mkdir(exist_ok=True)
-        (folder / CONFIG / "config.yaml").write_text(OmegaConf.to_yaml(config), encoding="utf-8")
-        (folder / CONFIG / "overrides.yaml").write_text(yaml.safe_dump(list(words), allow_unicode=True), encoding="utf-8")
+        make_folder(folder / CONFIG)
+        write_file(folder / CONFIG / "config.yaml", OmegaConf.to_yaml(config))
+        write_file(folder / CONFIG / "overrides.yaml", yaml.safe_dump(list(words), allow_unicode=True))
     except OSError as error:
         raise ConfigError("out", f"the folder cannot be written: {error.strerror}: {error.filename}", CURE) from error

@@ -12,6 +12,7 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
+from trihedron.pipeline.core.files import write_file
 from trihedron.pipeline.core.registry import ENTRY_POINT_GROUP
 
 JOB = "job.json"
@@ -63,7 +64,7 @@ def _files(path: Path) -> list[tuple[str, int, int]]:
 def write_job(folder: Path, key: str, state: str, error: str = "") -> None:
     """Say what is computed in a folder, and how far it came."""
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / JOB).write_text(json.dumps({"key": key, "state": state, "error": error}, indent=2) + "\n")
+    write_file(folder / JOB, json.dumps({"key": key, "state": state, "error": error}, indent=2) + "\n")
 
 
 def read_job(folder: Path) -> Job:

@@ -23,6 +23,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from trihedron.pipeline.core.config import graph_of
 from trihedron.pipeline.core.errors import ConfigError, UsageError, did_you_mean
+from trihedron.pipeline.core.files import write_file
 from trihedron.pipeline.core.graph import Graph
 from trihedron.pipeline.core.libraries import imports_of
 from trihedron.pipeline.core.plugin_configs import PLUGIN_KEY
@@ -126,7 +127,7 @@ class Search(Sweeper):
         best = sorted(valued, key=lambda pair: pair[0], reverse=self.direction == "maximize")[0][1]  # the first of equals
         content = {"objective": self.objective, "direction": self.direction, "seed": self.seed, "overrides": words}
         content |= {"best": asdict(best), "default": asdict(tried[0]), "trials": [asdict(trial) for trial in tried[1:]]}
-        (self.folder / SEARCH_FILE).write_text(json.dumps(content, indent=2) + "\n")
+        write_file(self.folder / SEARCH_FILE, json.dumps(content, indent=2) + "\n")
         failed = sum(trial.objective is None for trial in tried)
         print(f"search: {len(tried) - 1} trials{f', {failed} of them without a value' * bool(failed)}; {self.folder / SEARCH_FILE}")
         print(f"default  {self.objective} {tried[0].objective:.6g}  {' '.join(_words(tried[0].values))}")

@@ -28,6 +28,7 @@ from omegaconf import DictConfig
 
 from trihedron.pipeline.core.config import graph_of, rewrite_error
 from trihedron.pipeline.core.errors import TrihedronError, UsageError, did_you_mean
+from trihedron.pipeline.core.files import make_folder, write_file
 from trihedron.pipeline.core.libraries import library_error
 from trihedron.pipeline.core.overrides import with_literal_paths
 from trihedron.pipeline.core.registry import load_plugins, options_of, plugins_of
@@ -314,8 +315,9 @@ def _keep_overrides(folder: Path, job: Overrides) -> None:
     """Write the overrides that identify a job which ended before it could write them itself: it has no run then, but a reason."""
     file = folder / ".hydra" / "overrides.yaml"
     if not file.exists():
-        file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_text(yaml.safe_dump(job))
+        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(file.parent)
+        write_file(file, yaml.safe_dump(job))
 
 
 def _record_death(folder: Path) -> None:

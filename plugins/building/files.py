@@ -13,6 +13,7 @@ from xml.sax.saxutils import escape
 
 import numpy as np
 
+from trihedron.pipeline.core.files import new_file, write_file
 from trihedron.pipeline.core.linalg import norm
 from trihedron.pipeline.core.registry import register_files
 from trihedron.pipeline.core.types import ELEMENTS, F64, OPENING_KINDS, SUPPORTS, Building
@@ -38,8 +39,8 @@ SCHEMA_VERSION = 1
 @register_files("building")
 def write_building(out: Path, building: Building) -> list[str]:
     """Write the files of a run folder and return a line that describes them."""
-    (out / JSON).write_text(json.dumps(building_json(building), indent=1) + "\n", encoding="utf-8")
-    (out / SVG).write_text(floorplan_svg(building), encoding="utf-8")
+    write_file(out / JSON, json.dumps(building_json(building), indent=1) + "\n")
+    write_file(out / SVG, floorplan_svg(building))
     write_dxf(out / DXF, building)
     write_glb(out / GLB, building)
     return [summary(building)]
@@ -314,7 +315,8 @@ def write_dxf(path: Path, building: Building) -> None:
                 layer = "WINDOWS" if OPENING_KINDS[building.opening_kinds[opening]] == "window" else "DOORS"
                 corners = quad(building, int(wall), *building.spans_m[opening]) + shift
                 space.add_lwpolyline(corners.tolist(), close=True, dxfattribs={"layer": layer})
-    document.saveas(path)
+    with new_file(path) as new:
+        document.saveas(new)
 
 
 # glTF.
@@ -336,4 +338,4 @@ def write_glb(path: Path, building: Building) -> None:
         scene.add_geometry(mesh, node_name=name, geom_name=name)
     if not scene.geometry:
         scene.add_geometry(trimesh.PointCloud(np.zeros((1, 3))), node_name=building.note or "empty")
-    path.write_bytes(trimesh.exchange.gltf.export_glb(scene, include_normals=True))
+    write_file(path, trimesh.exchange.gltf.export_glb(scene, include_normals=True))

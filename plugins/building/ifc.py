@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from trihedron.pipeline.core.files import new_file
 from trihedron.pipeline.core.libraries import imports_of
 from trihedron.pipeline.core.linalg import norm
 from trihedron.pipeline.core.types import F64, Building
@@ -72,7 +73,8 @@ class _IfcWriter:
             self._opening(k, walls[wall])
         for number, root in enumerate(self.file.by_type("IfcRoot")):
             root.GlobalId = self._guid(number)
-        self.file.write(str(path))
+        with new_file(path) as new:
+            self.file.write(str(new))
 
     def _guid(self, number: int) -> str:
         import ifcopenshell.guid

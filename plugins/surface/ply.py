@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from trihedron.pipeline.core.files import write_file
 from trihedron.pipeline.core.types import F32, I32, U8, Surface
 
 AXES, COLORS = ("x", "y", "z"), ("red", "green", "blue")
@@ -24,7 +25,7 @@ def write_ply(path: Path, vertices_m: F32, colors: U8, triangles: I32, planes: I
     for k in range(3):
         points[AXES[k]], points[COLORS[k]] = vertices_m[:, k], colors[:, k]
     faces["count"], faces["corners"], faces["plane"] = 3, triangles, planes
-    path.write_bytes("\n".join(head).encode() + points.tobytes() + faces.tobytes())
+    write_file(path, "\n".join(head).encode() + points.tobytes() + faces.tobytes())
 
 
 def triangle_planes(surface: Surface) -> I32:

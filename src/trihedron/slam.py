@@ -33,6 +33,7 @@ from trihedron.pipeline.core.errors import ConfigError, UsageError, did_you_mean
 from trihedron.pipeline.core.graph import Graph
 from trihedron.pipeline.core.types import FrameReference, Map, Surface, Value
 from trihedron.pipeline.record.codec import FRAMES_TOPIC
+from trihedron.pipeline.record.mcap_writer import new_recording
 from trihedron.pipeline.record.rescue import recover
 from trihedron.pipeline.record.writer import RecordingWriter
 from trihedron.pipeline.run import results
@@ -274,11 +275,12 @@ class Slam:
             self._writer.flush()
             recover(self._out / RECORDING, file, being_written=True)
             return
-        writer = RecordingWriter(file, self._metadata("dataset"))
-        try:
-            self._write_history(writer)
-        finally:
-            writer.close()
+        with new_recording(file, "give another path") as new:
+            writer = RecordingWriter(new, self._metadata("dataset"))
+            try:
+                self._write_history(writer)
+            finally:
+                writer.close()
 
     @_of_one_thread
     def save_map(self, path: str | Path) -> None:

@@ -21,6 +21,7 @@ import numpy as np
 
 from trihedron.comparison.building_errors import plan_errors_of_run
 from trihedron.pipeline.core.errors import UsageError, did_you_mean
+from trihedron.pipeline.core.files import write_file
 from trihedron.pipeline.core.text_table import table
 from trihedron.tools.arguments import Parser
 
@@ -62,7 +63,7 @@ def main(argv: list[str]) -> int:
                 ]
     print(report(found))
     if options.json:
-        options.json.write_text(json.dumps(found, indent=2) + "\n")
+        write_file(options.json, json.dumps(found, indent=2) + "\n")
     return 0
 
 

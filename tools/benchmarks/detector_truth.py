@@ -27,6 +27,7 @@ import numpy as np
 from trihedron.datasets.simulation.synthetic import Synthetic
 from trihedron.pipeline.core.config import default_plugins
 from trihedron.pipeline.core.errors import TrihedronError, UsageError, did_you_mean
+from trihedron.pipeline.core.files import write_file
 from trihedron.pipeline.core.geometry import invert, transform
 from trihedron.pipeline.core.registry import load_plugins, options_of, parameters_of_method, plugin_class, plugins_of
 from trihedron.pipeline.core.text_table import table
@@ -93,7 +94,7 @@ def main(argv: list[str]) -> int:
         found[slot] = judge_plugins(slot, scenes)
         print(report(slot, found[slot]), end="\n\n", flush=True)
     if options.json:
-        options.json.write_text(json.dumps(found, indent=1) + "\n")
+        write_file(options.json, json.dumps(found, indent=1) + "\n")
     return 0
 
 

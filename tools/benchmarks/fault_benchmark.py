@@ -13,6 +13,7 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
+from trihedron.pipeline.core.files import write_file
 from trihedron.tools.arguments import Parser
 from trihedron.tools.benchmarks.judged_runs import FAULT, Case, check_overrides, chosen, judged_cases, kept_or_temporary, plain, report
 
@@ -50,7 +51,7 @@ def main(argv: list[str]) -> int:
         found = list(judged_cases(fault_cases(options.cases, overrides), folder))
     print("\n" + report(found))
     if options.json:
-        options.json.write_text(json.dumps([plain(one) for one in found], indent=2) + "\n")
+        write_file(options.json, json.dumps([plain(one) for one in found], indent=2) + "\n")
     return 0
 
 

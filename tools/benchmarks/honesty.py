@@ -28,6 +28,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from trihedron.pipeline.core.errors import UsageError
+from trihedron.pipeline.core.files import write_file
 from trihedron.pipeline.core.layouts import layout_of
 from trihedron.pipeline.sweep.sweep import words_of_sequence
 from trihedron.tools.arguments import Parser
@@ -59,7 +60,7 @@ def main(argv: list[str]) -> int:
     print("\n" + report(found))
     if options.json:
         content = {"rows": rows_of(found), "alarms": alarms_of(found), "rank": rank_by_sigma(found), "runs": [plain(one) for one in found]}
-        options.json.write_text(json.dumps(content, indent=2, ensure_ascii=False) + "\n")
+        write_file(options.json, json.dumps(content, indent=2, ensure_ascii=False) + "\n")
     return 0
 
 

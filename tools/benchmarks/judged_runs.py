@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from trihedron.pipeline.core.errors import UsageError, did_you_mean
+from trihedron.pipeline.core.files import write_file
 from trihedron.pipeline.core.text_table import table
 from trihedron.pipeline.sweep.paired_statistics import half_interval
 
@@ -130,7 +131,7 @@ def run_and_judge(run: Path, words: Sequence[str]) -> Judged:
     if not kept.exists() or json.loads(kept.read_text()) != list(words):
         kept.unlink(missing_ok=True)
         measure([*words, f"out={run}"], run)
-        kept.write_text(json.dumps(list(words)) + "\n")
+        write_file(kept, json.dumps(list(words)) + "\n")
     return judged_run(run)
 
 

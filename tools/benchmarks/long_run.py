@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from trihedron.pipeline.core.errors import UsageError
+from trihedron.pipeline.core.files import write_file
 from trihedron.pipeline.core.graph import Graph
 from trihedron.pipeline.core.slots import output_of
 from trihedron.pipeline.core.text_table import table
@@ -97,7 +98,7 @@ def main(argv: list[str]) -> int:
     text, kept = report(rows, arguments.warm_up)
     print(text)
     if arguments.json:
-        arguments.json.write_text(json.dumps({"machine": machine(), "rows": [asdict(row) for row in rows]}, indent=2) + "\n")
+        write_file(arguments.json, json.dumps({"machine": machine(), "rows": [asdict(row) for row in rows]}, indent=2) + "\n")
     return 0 if kept else 1
 
 

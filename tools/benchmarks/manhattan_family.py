@@ -24,6 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from trihedron.pipeline.core.errors import UsageError, did_you_mean
+from trihedron.pipeline.core.files import write_file
 from trihedron.pipeline.core.lie import exp_so3, log_so3
 from trihedron.pipeline.core.registry import load_plugins, plugin_class, plugins_of
 from trihedron.pipeline.core.text_table import table
@@ -71,7 +72,7 @@ def main(argv: list[str]) -> int:
     print(report(rows, reference))
     if options.json:
         values = {"orientations": options.orientations, "reference_ms": reference, "machine": machine(), "rows": rows}
-        options.json.write_text(json.dumps(values, indent=2) + "\n")
+        write_file(options.json, json.dumps(values, indent=2) + "\n")
     return 0
 
 

@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trihedron.pipeline.core.errors import UsageError
+from trihedron.pipeline.core.files import write_file
 from trihedron.pipeline.core.text_table import table
 from trihedron.pipeline.core.types import F64, LOST, Map, Pose, Table, Trajectory
 from trihedron.pipeline.record.codec import TIMING_TOPIC, timing_of
@@ -67,7 +68,7 @@ def main(argv: list[str]) -> int:
             figures[part] = measure(Path(folder), _sequences(options.sequences), options.overrides)
             print(report(figures[part]) + "\n", flush=True)
     if options.json:
-        options.json.write_text(json.dumps(figures, indent=2) + "\n")
+        write_file(options.json, json.dumps(figures, indent=2) + "\n")
     return 0
 
 

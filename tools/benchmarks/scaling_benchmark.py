@@ -24,6 +24,7 @@ import numpy as np
 
 from trihedron.pipeline.app.recorded_values import last_map
 from trihedron.pipeline.core.errors import DataError, UsageError
+from trihedron.pipeline.core.files import write_file
 from trihedron.pipeline.core.text_table import table
 from trihedron.pipeline.core.types import Map
 from trihedron.pipeline.record.codec import TIMING_TOPIC, timing_of
@@ -91,7 +92,7 @@ def _folders(*files: Path | None) -> None:
 
 def _write(figures: Mapping[str, Any], path: Path | None) -> None:
     if path is not None:
-        path.write_text(json.dumps(figures, indent=2) + "\n")
+        write_file(path, json.dumps(figures, indent=2) + "\n")
 
 
 def _rows(part: str, lengths: str) -> dict[str, list[str]]:

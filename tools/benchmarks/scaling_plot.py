@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from trihedron.pipeline.core.errors import DataError
+from trihedron.pipeline.core.files import new_file
 
 AXES = {"threads": "threads", "image": "image width, px", "features": "key points", "map": "points in the map", "length": "frames walked"}
 ALL, AFTER, BETWEEN, MULTIPLE, MEMORY = "tab:blue", "tab:green", "tab:red", "tab:purple", "tab:orange"
@@ -17,7 +18,8 @@ Rows = Sequence[Mapping[str, Any]]
 def plot(parts: Mapping[str, Rows], path: Path) -> None:
     """Write it as a PNG. Raises DataError when it cannot be written."""
     try:
-        figure_of(parts).savefig(path, format="png", dpi=DPI)
+        with new_file(path) as new:
+            figure_of(parts).savefig(new, format="png", dpi=DPI)
     except OSError as error:
         raise DataError(str(path), f"cannot be written ({error.strerror})", "give a file in a folder that exists") from error
 

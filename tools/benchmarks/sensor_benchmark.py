@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from trihedron.pipeline.core.errors import UsageError
+from trihedron.pipeline.core.files import write_file
 from trihedron.pipeline.core.text_table import table
 from trihedron.tools.arguments import Parser
 from trihedron.tools.benchmarks.judged_runs import (
@@ -63,7 +64,7 @@ def main(argv: list[str]) -> int:
         print("\n" + correlations([(figures, one.check.ate_m) for figures, one in zip(quality, found, strict=True)]))
     if options.json:
         rows = [{**plain(one), "quality": figures, "hidden": _hidden(one)} for figures, one in zip(quality, found, strict=True)]
-        options.json.write_text(json.dumps(rows, indent=2) + "\n")
+        write_file(options.json, json.dumps(rows, indent=2) + "\n")
     return 0
 
 

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from trihedron.pipeline.core.errors import UsageError, did_you_mean
+from trihedron.pipeline.core.files import write_file
 from trihedron.pipeline.core.registry import load_plugins, plugin_class, plugins_of
 from trihedron.pipeline.core.text_table import table
 from trihedron.pipeline.core.types import Map, Surface
@@ -52,7 +53,7 @@ def main(argv: list[str]) -> int:
         figures = measure_surfaces(run, names)
     print(report(figures))
     if options.json:
-        options.json.write_text(json.dumps(figures, indent=2) + "\n")
+        write_file(options.json, json.dumps(figures, indent=2) + "\n")
     return 0
 
 

@@ -23,6 +23,7 @@ from trihedron.pipeline.app.alternatives import Alternatives, Outcome, alternati
 from trihedron.pipeline.app.execute import MAX_THREADS, RECORDING
 from trihedron.pipeline.core.config import Feedback
 from trihedron.pipeline.core.errors import ConfigError, DataError, TrihedronError, UsageError, did_you_mean
+from trihedron.pipeline.core.files import write_file
 from trihedron.pipeline.core.slots import FOLDS
 from trihedron.pipeline.record.reader import Recording, TopicReader
 from trihedron.pipeline.record.trajectories import attached_truth
@@ -158,7 +159,7 @@ def known_cases(out: Path) -> Mapping[str, Any]:
 def _write(out: Path, cases: Mapping[str, Any]) -> None:
     try:
         out.mkdir(parents=True, exist_ok=True)
-        (out / RESULT).write_text(json.dumps(cases, indent=2) + "\n")
+        write_file(out / RESULT, json.dumps(cases, indent=2) + "\n")
     except OSError as error:
         raise DataError(str(out), f"cannot be written: {error.strerror}", "give another out=DIR") from error
 

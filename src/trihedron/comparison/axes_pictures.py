@@ -13,6 +13,7 @@ from trihedron.pipeline.app.recorded_run import composed_run
 from trihedron.pipeline.app.recorded_values import frames_of, references_of
 from trihedron.pipeline.core.config import make_plugin
 from trihedron.pipeline.core.errors import TrihedronError
+from trihedron.pipeline.core.files import new_file
 from trihedron.pipeline.core.lie import rotation_angle_deg
 from trihedron.pipeline.core.types import F64, Normals
 from trihedron.pipeline.record.reader import Recording
@@ -48,7 +49,8 @@ def errors_figure(runs: Sequence[Run], errors_deg: Sequence[F64], path: Path) ->
     axes[0].legend(fontsize=8, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, frameon=False, borderaxespad=0.0)
     axes[-1].set_xlabel("frame")
     figure.supylabel("rotation error (°)", fontsize=10)
-    figure.savefig(path, dpi=100)
+    with new_file(path) as new:
+        figure.savefig(new, dpi=100)
 
 
 def sphere_figure(runs: Sequence[Run], world: F64, frame: int, path: Path) -> None:
@@ -78,7 +80,8 @@ def sphere_figure(runs: Sequence[Run], world: F64, frame: int, path: Path) -> No
     handles = [*grid[0].get_legend_handles_labels()[0], Line2D([], [], **RING, color="tab:green", linestyle="", label="axes estimated")]
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), fontsize=9, frameon=False)
     figure.suptitle(f"directions of frame {frame}, opposite ones folded", fontsize=11)
-    figure.savefig(path, dpi=100)
+    with new_file(path) as new:
+        figure.savefig(new, dpi=100)
 
 
 def _draw_directions(ax: Any, features: dict[str, Any]) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 
 from trihedron.comparison.surface_errors import FIGURES, SURFACE, evaluate_files
 from trihedron.pipeline.core.errors import DataError
-from trihedron.pipeline.core.files import file_sha256
+from trihedron.pipeline.core.files import file_sha256, write_file
 
 BUILDING = {  # column -> key of the figures, the value where it is perfect, factor
     "walls mm": ("wall_m", 0.0, 1e3),
@@ -49,7 +49,7 @@ def judge_surface(run: Path, recording: Path) -> dict[str, Any]:
 
 def _write_figures(run: Path, figures: dict[str, Any]) -> dict[str, Any]:
     """Write the figures of a run's surface to surface.json, and return them."""
-    (run / FIGURES).write_text(json.dumps(figures, indent=2) + "\n")
+    write_file(run / FIGURES, json.dumps(figures, indent=2) + "\n")
     return figures
 
 

@@ -6,6 +6,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from trihedron.pipeline.core.files import new_file
+
 if TYPE_CHECKING:
     from trihedron.pipeline.core.types import Camera, Map, Planes
     from trihedron.pipeline.record.reader import Recording
@@ -39,7 +41,8 @@ def draw(path: str, frame: int, out: Path) -> None:
     left.set_axis_off()
     left.set_title(f"frame {frame}: planes, 3D lines, key points, Manhattan axes", fontsize=10)
     _map_from_above(right, recording, poses)
-    figure.savefig(out, dpi=DPI)
+    with new_file(out) as new:
+        figure.savefig(new, dpi=DPI)
 
 
 def draw_pair(sides: Sequence[tuple[str, Sequence[Recording]]], frame: int, out: Path) -> None:
@@ -59,7 +62,8 @@ def draw_pair(sides: Sequence[tuple[str, Sequence[Recording]]], frame: int, out:
     axes[2].set_xlabel("x [m]")
     axes[2].set_ylabel("z [m]")
     axes[2].legend(loc="best", fontsize=8)
-    figure.savefig(out, dpi=80)
+    with new_file(out) as new:
+        figure.savefig(new, dpi=80)
 
 
 def _path_from_above(axes: Any, poses: Iterable[Any], frame: int, title: str, color: str, style: str) -> None:
