@@ -17,8 +17,9 @@ PYTHON := $(shell for p in python3.14 python3.13 python3.12 python3.11 python3.1
 
 .PHONY: demo test test-slow test-newest benchmark table results docs release lock install clean
 .DELETE_ON_ERROR:
+.NOTPARALLEL:
 
-demo: install  ## track the built-in synthetic room
+demo: $(VENV)/base  ## track the built-in synthetic room; installs what that needs, without the tools of developers
 	$(BIN)/trihedron run out=$(OUT)
 	@echo
 	@echo "Look at $(OUT)/trajectory.png (the path and its errors), $(OUT)/metrics.json, $(OUT)/timing.json,"
@@ -97,6 +98,12 @@ $(VENV)/installed: $(VENV)/created pyproject.toml $(LOCK)
 	@echo "Installing into $(VENV) (about 1.5 GB to download the first time)"
 	$(PIP) --quiet --upgrade pip setuptools
 	$(PIP) --upgrade --upgrade-strategy eager --no-build-isolation -e ".[dev]"
+	@touch $(VENV)/base $@
+
+$(VENV)/base: $(VENV)/created pyproject.toml $(LOCK)
+	@echo "Installing into $(VENV) (about 700 MB to download the first time)"
+	$(PIP) --quiet --upgrade pip setuptools
+	$(PIP) --upgrade --upgrade-strategy eager --no-build-isolation -e .
 	@touch $@
 
 # 3: a library that only some stages use is missing; said each time, until it is there.

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ast
 import errno
+import gc
 import io
 import os
 import shlex
@@ -180,7 +181,8 @@ def _run(words: list[str]) -> int:
             raise UsageError(word, "is not an option of run", f"known: {', '.join((*RUN_FLAGS, DRY_RUN[0]))}; everything else is key=value")
         if word.startswith("=") or word == "out=":
             raise UsageError(word, "lacks a " + ("key" if word.startswith("=") else "folder"), "write key=value, for example out=runs/mine")
-    words = _in_current_names(words)
+    with memory.gc_paused():
+        words = _in_current_names(words)
     if _is_sweep(words):
         from trihedron.pipeline.core.config import check_added
 
@@ -192,13 +194,15 @@ def _run(words: list[str]) -> int:
 
 def _in_current_names(words: list[str]) -> list[str]:
     """The words with the names of earlier versions replaced, each with a warning."""
-    from trihedron.pipeline.core.registry import load_plugins, options_of, plugins_of
+    from trihedron.pipeline.core.registry import load_packages, load_plugins, options_of, plugins_of
     from trihedron.pipeline.core.renamed import current_words
-    from trihedron.pipeline.core.slots import SLOTS
 
-    load_plugins()
-    options = {slot: {name: {option.name for option in options_of(plugin)} for name, plugin in plugins_of(slot).items()} for slot in SLOTS}
-    words, warnings = current_words(words, options)
+    def options_of_slot(slot: str) -> dict[str, set[str]]:
+        load_plugins()
+        return {name: {option.name for option in options_of(plugin)} for name, plugin in plugins_of(slot).items()}
+
+    load_packages()
+    words, warnings = current_words(words, options_of_slot)
     for warning in warnings:
         print(f"trihedron: warning: {warning}", file=sys.stderr)
     return words
@@ -238,10 +242,11 @@ def run_once(words: list[str], began: float) -> tuple[Path, dict[str, Any]]:
 
         check_added(words)
         config = compose_run(words, _recorded_config(words))
+        from trihedron.pipeline.app.execute import execute
+
+        gc.freeze()  # what is imported stays: no collection looks at it again
     if config.dry_run:
         raise UsageError(DRY_RUN[0], "is of a sweep, and this is one run", "add -m to run once with each of several values")
-    from trihedron.pipeline.app.execute import execute
-
     try:
         out = Path(config.out).expanduser().absolute()
     except Exception as error:  # an interpolation of the user's that leads nowhere
@@ -258,10 +263,10 @@ def _sweep(words: list[str], recorded: RecordedConfig | None) -> int:
     import hydra
 
     from trihedron.pipeline.core.config import register_configs, rewrite_error
-    from trihedron.pipeline.core.registry import load_plugins
+    from trihedron.pipeline.core.registry import load_packages
 
     os.environ["HYDRA_FULL_ERROR"] = "1"  # exceptions come to us instead of being printed
-    load_plugins()
+    load_packages()
     register_configs(recorded)
     overrides = with_literal_paths(words, sweep=True)
     outcomes = _run_sweep(words)
@@ -317,10 +322,10 @@ def _task(config: DictConfig) -> float | None:
 def _job(config: DictConfig, out: Path, work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
     """Do the work of a job, keeping what it prints in its folder, and how it ended in job.json."""
     from trihedron.pipeline.core.files import open_anew
-    from trihedron.pipeline.core.registry import load_plugins
+    from trihedron.pipeline.core.registry import load_packages
     from trihedron.pipeline.sweep.jobs import DONE, FAILED, RUNNING, key_of, write_job
 
-    load_plugins()
+    load_packages()
     key = key_of(config)
     write_job(out, key, RUNNING)
     try:

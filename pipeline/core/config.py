@@ -25,7 +25,7 @@ from trihedron.pipeline.core.graph import Graph, build_graph
 from trihedron.pipeline.core.libraries import library_error
 from trihedron.pipeline.core.overrides import with_literal_paths
 from trihedron.pipeline.core.plugin_configs import PLUGIN_KEY, offer_plugins, with_defaults
-from trihedron.pipeline.core.registry import cure_of_unknown, load_plugins, options_of, plugin_class, plugins_of
+from trihedron.pipeline.core.registry import cure_of_unknown, load_packages, load_plugins, options_of, plugin_class, plugins_of
 from trihedron.pipeline.core.slots import SLOTS, Localising, default_wires
 
 RECORDED_GRAPH = "recorded"  # in a replay: the option of `graph` with the wires of the recording
@@ -135,7 +135,7 @@ class RecordedConfig:
 
 
 def register_configs(recorded: RecordedConfig | None = None) -> None:
-    """Let Hydra know every loaded plugin, and put the rest into its ConfigStore; call `registry.load_plugins` first.
+    """Let Hydra know every plugin, and put the rest into its ConfigStore; call `registry.load_packages` first.
 
     The values of a recording take the place of the defaults: of its plugins' options, of the root keys, and of the graph, as `graph=recorded`."""
     store, recorded = ConfigStore.instance(), recorded or RecordedConfig()
@@ -224,7 +224,7 @@ def compose_run(overrides: Iterable[str], recorded: RecordedConfig | None = None
 
 def composed_each(overrides: Iterable[Iterable[str]], recorded: RecordedConfig | None = None) -> list[DictConfig]:
     """Compose one configuration for each list of overrides; other threads wait. Raises TrihedronError, one line."""
-    load_plugins()
+    load_packages()
     with _COMPOSING:
         register_configs(recorded)
         try:
@@ -268,6 +268,7 @@ def _unknown_option(group: str, name: str, options: list[str]) -> TrihedronError
 def _unknown_key(key: str) -> TrihedronError:
     group, _, option = key.rpartition(".")
     if group in SLOTS:
+        load_plugins()
         owners = {name: {f.name for f in options_of(plugin)} for name, plugin in plugins_of(group).items()}
         having = sorted(name for name, options in owners.items() if option in options)
         all_options = {known for options in owners.values() for known in options}

@@ -1,4 +1,4 @@
-"""Hydra's options `slot=name`: the configuration of each registered plugin, made when it is asked for.
+"""Hydra's options `slot=name`: the configuration of each plugin, made when it is asked for.
 
 Hydra copies its ConfigStore with every composition; to convert and copy the configurations of all plugins takes as long as a short run.
 """
@@ -18,7 +18,7 @@ from hydra.plugins.config_source import ConfigResult, ConfigSource
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf
 
-from trihedron.pipeline.core.registry import load_plugins, options_of, plugin_class, plugins_of
+from trihedron.pipeline.core.registry import find_plugin, load_plugins, options_of, plugin_class, plugins_of
 from trihedron.pipeline.core.slots import SLOTS
 
 PLUGIN_KEY = "plugin"  # which plugin a slot's configuration belongs to
@@ -26,7 +26,7 @@ SCHEME = "trihedron"
 
 
 class PluginConfigs(ConfigSource):
-    """Source of one group for each slot, with one configuration for each plugin that is registered. Processes of a sweep are sent a copy."""
+    """Source of one group for each slot, with one configuration for each plugin. Processes of a sweep are sent a copy."""
 
     offered: ClassVar[Mapping[str, DictConfig]] = {}  # by slot: the configuration of its plugin in a recording
 
@@ -46,9 +46,7 @@ class PluginConfigs(ConfigSource):
 
     def is_config(self, config_path: str) -> bool:
         slot, name = _parts(config_path)
-        if slot in SLOTS and not plugins_of(slot):
-            load_plugins()  # in a process of a sweep, which begins with this copy
-        return slot in SLOTS and name in plugins_of(slot)
+        return slot in SLOTS and find_plugin(slot, name) is not None
 
     def load_config(self, config_path: str) -> ConfigResult:
         slot, name = _parts(config_path)
@@ -56,14 +54,17 @@ class PluginConfigs(ConfigSource):
         if recorded is not None and recorded[PLUGIN_KEY] == name:
             node = copy.deepcopy(recorded)
         else:
-            node = plugin_config(name, plugins_of(slot)[name])
+            node = plugin_config(name, plugin_class(slot, name))
         return ConfigResult(provider=self.provider, path=self.full_path(), config=node, header={"package": None})
 
     def list(self, config_path: str, results_filter: ObjectType | None) -> list[str]:
         slot = config_path.rstrip("/")
         if not slot:
             return [] if results_filter == ObjectType.CONFIG else sorted(SLOTS)
-        return [] if results_filter == ObjectType.GROUP or slot not in SLOTS else list(plugins_of(slot))
+        if results_filter == ObjectType.GROUP or slot not in SLOTS:
+            return []
+        load_plugins()
+        return list(plugins_of(slot))
 
 
 class PluginSearchPath(SearchPathPlugin):
@@ -74,7 +75,7 @@ class PluginSearchPath(SearchPathPlugin):
 
 
 def offer_plugins(recorded: Mapping[str, Mapping[str, Any]]) -> None:
-    """Let Hydra find the configurations of all registered plugins, with the options of a recording, by slot, instead of the defaults."""
+    """Let Hydra find the configurations of all plugins, with the options of a recording, by slot, instead of the defaults."""
     for kind in (PluginConfigs, PluginSearchPath):
         Plugins.instance().register(kind)
     kinds = {slot: _option_type(options[PLUGIN_KEY], plugin_class(slot, options[PLUGIN_KEY])) for slot, options in recorded.items()}

@@ -19,7 +19,7 @@ from trihedron.pipeline.core.errors import RecordingError, TrihedronError
 from trihedron.pipeline.core.files import YamlError, parse_yaml
 from trihedron.pipeline.core.overrides import literal_text
 from trihedron.pipeline.core.plugin_configs import PLUGIN_KEY, plugin_config
-from trihedron.pipeline.core.registry import load_plugins, plugin_class
+from trihedron.pipeline.core.registry import load_packages, plugin_class
 from trihedron.pipeline.core.renamed import current_option, current_plugin
 from trihedron.pipeline.core.slots import SLOTS
 
@@ -34,7 +34,7 @@ def recorded_config(text: str, place: str) -> RecordedConfig:
     """Check the YAML `text` of the recording `place`: known options of registered plugins, each of its type and within its range.
 
     Raises RecordingError, one line, for anything else; keys that a replay does not take are ignored."""
-    load_plugins()
+    load_packages()
     content = _parse_mapping(text, place)
     options = {slot: _options(content[slot], slot, place) for slot in SLOTS if content.get(slot) is not None}
     graph = _graph(content["graph"], place) if content.get("graph") is not None else None

@@ -1,4 +1,7 @@
-"""Plugins by slot and name, checked against their slot's contract when they register."""
+"""Plugins by slot and name, checked against their slot's contract when they register.
+
+A built-in plugin registers when it is looked up: the module of `SLOT=NAME` is `trihedron.plugins.SLOT.NAME`, or has that name in a package of HOMES.
+Only what lists plugins, and a name that is none of these, imports them all."""
 
 from __future__ import annotations
 
@@ -11,6 +14,7 @@ import sys
 import threading
 from collections.abc import Callable
 from importlib.metadata import EntryPoint, entry_points
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
 
@@ -27,6 +31,7 @@ Key = TypeVar("Key")
 Function = TypeVar("Function", bound=Callable[..., Any])
 _PLUGINS: dict[str, dict[str, type[Any]]] = {slot: {} for slot in SLOTS}
 _BUILT_IN = ("trihedron.datasets", "trihedron.plugins")
+HOMES = {"dataset": ("trihedron.datasets.readers", "trihedron.datasets.simulation", "trihedron.datasets.faults")}
 ENTRY_POINT_GROUP = "trihedron.plugins"
 _BROKEN: dict[EntryPoint, str] = {}  # packages of plugins that do not load, and why
 _LOADING = threading.RLock()
@@ -57,6 +62,8 @@ def register(slot: str, name: str) -> Callable[[Plugin], Plugin]:
         place = f"plugin {slot}={name} ({_source_of(plugin)})"
         if slot not in SLOTS:
             raise PluginError(place, f"there is no slot '{slot}'", did_you_mean(slot, SLOTS))
+        if not plugin.__module__.startswith(_BUILT_IN):
+            _load_by_name(slot, name)  # so that nobody takes a built-in name
         known = _PLUGINS[slot].get(name)
         if known is not None and (known.__module__, known.__qualname__) != (plugin.__module__, plugin.__qualname__):
             raise PluginError(place, f"the name is taken by {_source_of(known)}", "register it under another name")
@@ -135,9 +142,31 @@ def plugin_class(slot: str, name: str) -> type[Any]:
     """Return the class registered under slot and name. Raises PluginError with the closest names otherwise."""
     if slot not in SLOTS:
         raise PluginError(slot, f"there is no slot '{slot}'", did_you_mean(slot, SLOTS))
-    if name not in _PLUGINS[slot]:
+    found = find_plugin(slot, name)
+    if found is None:
         raise PluginError(slot, f"there is no plugin '{name}' for the slot '{slot}'", cure_of_unknown(slot, name))
-    return _PLUGINS[slot][name]
+    return found
+
+
+def find_plugin(slot: str, name: str) -> type[Any] | None:
+    """Return the class registered under a slot and a name, importing its module if that is built in, else every plugin; None where there is none."""
+    if name not in _PLUGINS[slot]:
+        _load_by_name(slot, name)
+    if name not in _PLUGINS[slot]:
+        load_plugins()
+    return _PLUGINS[slot].get(name)
+
+
+def _load_by_name(slot: str, name: str) -> None:
+    """Import the built-in module of a plugin, if there is one."""
+    if name == "none":
+        importlib.import_module("trihedron.plugins.none")
+    elif name.isidentifier():
+        for package in HOMES.get(slot, (f"trihedron.plugins.{slot}",)):
+            importlib.import_module(package)
+            if find_spec(f"{package}.{name}") is not None:
+                importlib.import_module(f"{package}.{name}")
+                return
 
 
 def cure_of_unknown(slot: str, name: str) -> str:
@@ -163,6 +192,8 @@ def register_files(slot: str) -> Callable[[FileWriter], FileWriter]:
 
 def write_files_of(slot: str, folder: Path, value: Any) -> list[str]:
     """Write the files of a fold's value into a folder; returns lines that describe them, none where the slot has no files."""
+    if slot not in _FILES:
+        load_plugins()
     return _FILES[slot](folder, value) if slot in _FILES else []
 
 
@@ -172,7 +203,9 @@ def register_drawing(kind: type[Value]) -> Callable[[DrawingOf], DrawingOf]:
 
 
 def drawing_of(value: Value) -> Drawing:
-    """Return what is drawn of a value; nothing where the plugins of its slot are not loaded (`load_plugins`)."""
+    """Return what is drawn of a value; nothing where no plugin draws it."""
+    if type(value) not in _DRAWINGS:
+        load_plugins()
     return _DRAWINGS[type(value)](value) if type(value) in _DRAWINGS else Drawing()
 
 
@@ -183,11 +216,13 @@ def register_covariance(cause: str) -> Callable[[CovariancePart], CovariancePart
 
 def covariance_due_to(cause: str, pose: Pose) -> F64:
     """Return the part (6, 6) of a pose's covariance that is due to `cause`; zero where no plugin knows of it."""
+    if cause not in _COVARIANCES:
+        load_plugins()
     return _COVARIANCES[cause](pose) if cause in _COVARIANCES else np.zeros((6, 6))
 
 
 def plugins_of(slot: str) -> dict[str, type[Any]]:
-    """Return name -> class of a slot's registered plugins, sorted by name."""
+    """Return name -> class of a slot's registered plugins, sorted by name; of all of them after `load_plugins`."""
     return dict(sorted(_PLUGINS[slot].items()))
 
 
@@ -210,10 +245,17 @@ def _load_built_in() -> None:
 
 
 def load_plugins() -> None:
-    """Import every built-in plugin and each module of the entry-point group `trihedron.plugins`. A package that does not load is reported once, on
-    standard error, and left out; its plugins are unknown names."""
+    """Import every built-in plugin, and those of packages (`load_packages`)."""
     with _LOADING:
         _load_built_in()
+        load_packages()
+
+
+def load_packages() -> None:
+    """Import each module of the entry-point group `trihedron.plugins`, and the names of earlier versions. A package that does not load is reported
+    once, on standard error, and left out; its plugins are unknown names."""
+    with _LOADING:
+        importlib.import_module("trihedron.plugins.renamed")
         for entry in entry_points(group=ENTRY_POINT_GROUP):
             if entry in _BROKEN:
                 continue
@@ -227,7 +269,7 @@ def load_plugins() -> None:
 
 
 def broken_packages() -> dict[str, str]:
-    """Return each installed package of plugins that does not load, with its module, and why; call `load_plugins` first."""
+    """Return each installed package of plugins that does not load, with its module, and why; call `load_packages` first."""
     return {_package_of(entry): cause for entry, cause in _BROKEN.items()}
 
 

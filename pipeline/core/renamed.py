@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 WORDS = {"experiment=paper_table": "experiment=paper"}
 _PLUGINS: dict[tuple[str, str], str] = {}  # (slot, old name) -> name
@@ -31,10 +31,10 @@ def current_option(slot: str, plugin: str, option: str) -> str | None:
     return _OPTIONS.get((slot, plugin), {}).get(option, option)
 
 
-def current_words(words: Iterable[str], options: dict[str, dict[str, set[str]]]) -> tuple[list[str], list[str]]:
+def current_words(words: Iterable[str], options_of_slot: Callable[[str], dict[str, set[str]]]) -> tuple[list[str], list[str]]:
     """Return words of the command line in today's names, and a warning for each that was changed or dropped.
 
-    `options` holds the names of the options by slot and plugin: an option of a plugin that no word names is taken as renamed only where no plugin of
+    `options_of_slot` gives the names of the options by plugin: an option of a plugin that no word names is taken as renamed only where no plugin of
     the slot has it."""
     given = [WORDS.get(word, word) for word in words]
     warnings = [f"{old} is now {new}" for old, new in zip(words, given) if old != new]
@@ -46,8 +46,8 @@ def current_words(words: Iterable[str], options: dict[str, dict[str, set[str]]])
         new: str | None = word
         if (slot, value) in _PLUGINS and not dot:
             new = f"{key}={_PLUGINS[slot, value]}"
-        elif equals and dot and slot in options:
-            new = _current(word, slot, option, value, chosen.get(slot), options[slot])
+        elif equals and dot and any(of == slot and option in names for (of, _), names in _OPTIONS.items()):
+            new = _current(word, slot, option, value, chosen.get(slot), options_of_slot(slot))
         if new != word:
             warnings.append(f"{word} is now {new}" if new else f"{key} is no longer an option, and is ignored")
         if new is not None:

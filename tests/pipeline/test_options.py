@@ -78,6 +78,7 @@ class Inherits(Example):
     ],
 )
 def test_a_registered_plugin_refuses_an_option_out_of_range(monkeypatch, kind, options, message):
+    registry.load_plugins()
     monkeypatch.setattr(registry, "_PLUGINS", {slot: {} for slot in SLOTS})
     plugin = register("normals", "mine")(dataclass(frozen=True)(type("Mine", (kind,), {})))
     assert plugin(free=-5.0).free == -5.0

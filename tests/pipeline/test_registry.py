@@ -1,5 +1,7 @@
 """A plugin that breaks its slot's contract is refused when it registers, with its name and file."""
 
+import subprocess
+import sys
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +15,7 @@ from trihedron.pipeline.core.types import Frame, Keypoints, Map, Normals, Surfac
 
 @pytest.fixture(autouse=True)
 def own_plugins(monkeypatch):
+    registry.load_plugins()
     monkeypatch.setattr(registry, "_PLUGINS", {slot: {} for slot in registry._PLUGINS})
 
 
@@ -150,3 +153,30 @@ def test_a_plugin_package_that_does_not_load_disables_only_itself(monkeypatch, c
         "it may be in mine (mine.plugins), which does not load: ImportError: No module named 'mine'; "
         "it may be in mine (other), which does not load: SystemExit: 3"
     )
+
+
+def test_every_built_in_plugin_is_found_by_its_name_alone(monkeypatch):
+    """Its module has its name, so that a run imports those of its own graph."""
+    monkeypatch.undo()  # all plugins again
+    registry.load_plugins()
+    for slot in registry._PLUGINS:
+        for name, plugin in plugins_of(slot).items():
+            packages = registry.HOMES.get(slot, (f"trihedron.plugins.{slot}",))
+            allowed = {f"{package}.{name}" for package in packages} | {"trihedron.plugins.none"}
+            assert plugin.__module__ in allowed or not plugin.__module__.startswith("trihedron."), f"{slot}={name} is in {plugin.__module__}"
+
+
+def test_a_graph_imports_no_plugin_of_another():
+    code = (
+        "import sys; from trihedron.pipeline.core.config import compose_run, graph_of; "
+        "graph_of(compose_run(['graph=points', 'keypoints.features=200'])); "
+        "print(*sorted(name for name in sys.modules if name.startswith('trihedron.plugins.')))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)
+    modules = done.stdout.split()
+    assert "trihedron.plugins.keypoints.orb" in modules and "trihedron.plugins.surface.surfels" not in modules, done.stderr
+
+
+def test_a_package_cannot_take_a_built_in_name(monkeypatch):
+    monkeypatch.undo()
+    assert refusal("keypoints", Good, "orb").endswith("register it under another name")

@@ -29,7 +29,7 @@ def names(monkeypatch):
     ],
 )
 def test_words(names, words, now, warnings):
-    assert renamed.current_words(words, OPTIONS) == (now, warnings)
+    assert renamed.current_words(words, OPTIONS.__getitem__) == (now, warnings)
 
 
 def test_a_removed_option_is_ignored_in_a_run_and_in_a_recording(capsys, tmp_path):

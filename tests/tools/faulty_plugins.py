@@ -44,6 +44,7 @@ class NoisyPlanes:
 def faulty(monkeypatch):
     """Plugins with a known fault, for the length of a test."""
     registry.load_plugins()  # before the copy, which is discarded with all that is registered in it
+    registry.load_plugins()
     monkeypatch.setattr(registry, "_PLUGINS", {slot: dict(plugins) for slot, plugins in registry._PLUGINS.items()})
     registry.register("translation", "wrong_sign")(WrongSign)
     registry.register("planes", "noisy")(NoisyPlanes)
