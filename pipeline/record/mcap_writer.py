@@ -85,10 +85,12 @@ class McapWriter:
             with self._writing:
                 self._writer.attach(log_time=0, create_time=0, name=name, media_type="text/plain", data=text.encode())
 
-    def channel(self, topic: str, schema: str, encoding: str, definition: bytes, message_encoding: str) -> int:
+    def channel(
+        self, topic: str, schema: str, encoding: str, definition: bytes, message_encoding: str, metadata: dict[str, str] | None = None
+    ) -> int:
         """Declare a channel; returns its number. For the queued functions to call: no other thread writes then."""
         described = foxglove.Schema(name=schema, encoding=encoding, data=definition)
-        self._channels.append(foxglove.Channel(topic, schema=described, message_encoding=message_encoding, context=self._context))
+        self._channels.append(foxglove.Channel(topic, schema=described, message_encoding=message_encoding, context=self._context, metadata=metadata))
         return len(self._channels) - 1
 
     def add(self, size: int, make: Callable[[], Messages]) -> None:

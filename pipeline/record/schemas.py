@@ -1,7 +1,7 @@
 """Protobuf schemas of a recording: one message for each type of value, generated from its dataclass, with docstring, shapes and units as comments.
 
 `trihedron.Planes` has the fields of `types.Planes` behind four that all have: `type, version, index, stamp_ns`. Numbers and texts are native, nested
-values are messages, an array is a `trihedron.Array`, a table a `trihedron.Table`. `docs/reference/recording.md` explains these two.
+values are messages, an array is a `trihedron.Array`, a table a `trihedron.Table`. `docs/reference/file-formats.md` explains these two.
 Until format 4 every value was a `trihedron.Value`, which named its arrays.
 """
 
@@ -35,6 +35,12 @@ _NUMBERS = {bool: _FIELD.TYPE_BOOL, int: _FIXED64, float: _FIELD.TYPE_DOUBLE}  #
 _HEADER_KINDS = dict(zip(HEADER, (_TEXT, _INT32, _INT64, _INT64)))
 _HEADER_COMMENTS = ("name of the type", "of the type's fields", "number of the frame in the data set", "time of the frame, ns")
 
+CONVENTIONS = {  # of all channels, in their metadata
+    "ids": "index: the frame's number in the data set; an id of a keyframe or landmark is its row in the map's table, for good",
+    "units": "metres, radians, pixels, unless the end of a field's name says another: _deg, _ns, _s, _ms, _mb; log time: the frame's stamp",
+    "frames": "camera: x right, y down, z forward; world: the camera of the first frame; T_a_b maps points of b into a: p_a = T_a_b p_b",
+}
+
 VALUE_TYPES: dict[str, type[Value]] = {
     name: kind for name, kind in vars(types).items() if isinstance(kind, type) and issubclass(kind, Value) and kind is not Value
 }
@@ -61,7 +67,7 @@ def own_fields(kind: Any) -> dict[str, int]:
 # Files of the schemas.
 
 _ARRAY_COMMENTS = {
-    "Array": "An array, row by row. encoding: raw | columns | zstd | rows, see docs/reference/recording.md.",
+    "Array": "An array, row by row. encoding: raw | columns | zstd | rows, see docs/reference/file-formats.md.",
     "Table": "Rows of named columns: all of them, or those that changed since an earlier message. layout is JSON: size, back (messages since "
     "the table that this changes; 0: none, this is all of it), schema {column: [dtype, shape, step]}, rows {column: k}: numbers of rows in rows<k>.",
 }
@@ -186,3 +192,9 @@ def definition(name: str) -> bytes:
     """Return the schema of `trihedron.<name>` as a FileDescriptorSet with comments."""
     file = _add_message_file(name)
     return bytes(descriptor_pb2.FileDescriptorSet(file=[*([_ARRAYS] if file.dependency else []), file]).SerializeToString())
+
+
+def channel_metadata(name: str) -> dict[str, str]:
+    """Return what a reader of a channel of `trihedron.<name>` has to know besides the schema: what it is, its ids, units and frames."""
+    about = {"type": name, "meaning": " ".join((inspect.getdoc(VALUE_TYPES[name]) or "").split())} if name in VALUE_TYPES else {"type": name}
+    return about | CONVENTIONS

@@ -16,7 +16,7 @@ from trihedron.pipeline.record.embedded_images import messages_of
 from trihedron.pipeline.record.foxglove import TopicView
 from trihedron.pipeline.record.foxglove_server import FoxgloveServer
 from trihedron.pipeline.record.mcap_writer import FLUSH_SECONDS, McapWriter
-from trihedron.pipeline.record.schemas import PACKAGE, definition, message_class
+from trihedron.pipeline.record.schemas import PACKAGE, channel_metadata, definition, message_class
 
 SPARSE_BYTES = 1 << 15  # assumed size of a value of a topic that is not dense
 
@@ -95,7 +95,8 @@ class RecordingWriter:
     def _own_channel(self, channel: str, name: str) -> int:
         """The channel of messages `trihedron.<name>`."""
         if channel not in self._channels:
-            self._channels[channel] = self._file.channel(channel, f"{PACKAGE}.{name}", "protobuf", definition(name), "protobuf")
+            described = f"{PACKAGE}.{name}", "protobuf", definition(name), "protobuf", channel_metadata(name)
+            self._channels[channel] = self._file.channel(channel, *described)
         return self._channels[channel]
 
     def flush(self) -> None:

@@ -150,6 +150,20 @@ def test_what_is_asked_for_later_is_written_then(tmp_path):
     assert set(Recording(tmp_path / "a.mcap").frame(2)) == {"frames", "keypoints"}
 
 
+def test_a_channel_says_its_ids_units_and_frames(tmp_path):
+    """To a reader that knows the format MCAP alone."""
+    writer = RecordingWriter(tmp_path / "a.mcap", {"overrides": "[]"})
+    writer.write("keypoints", keypoints(0))
+    writer.write_timing(0, 0, 1.0, {}, 2.0)
+    writer.close()
+    with open(tmp_path / "a.mcap", "rb") as file:
+        described = {channel.topic: channel.metadata for channel in make_reader(file).get_summary().channels.values()}
+    points, timing = described["/keypoints"], described["/timing"]
+    assert set(points) == {"type", "meaning", "ids", "units", "frames"} and set(timing) == set(points) - {"meaning"}
+    assert points["type"] == "Keypoints" and points["meaning"].startswith("Points of interest. `points_m` is the back-projection")
+    assert points["units"].startswith("metres, radians, pixels") and "x right, y down, z forward" in points["frames"]
+
+
 def test_topics_and_values(tmp_path):
     recording = Recording(write(tmp_path / "a.mcap", [0, 1, 2, 3, 5]))
     assert recording.topics == {"keypoints"} and recording.counts == {"/keypoints": 5, "/timing": 5}
