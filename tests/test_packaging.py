@@ -92,13 +92,15 @@ def test_benchmarks_of_the_wheel(words, code, said, wheel, tmp_path):
     assert done.returncode == code and done.stderr.startswith(f"trihedron: {said}") and done.stderr.count("\n") == 1, done.stderr
 
 
-def installed(wheel: Path, folder: Path, *, with_dependencies: bool) -> Path:
-    """A new environment that holds the wheel; without dependencies of its own it borrows those of this one. Returns its bin folder."""
+def installed(wheel: Path, folder: Path, *, with_dependencies: bool, requirements: Path | None = None) -> Path:
+    """A new environment that holds the wheel; without dependencies of its own it has those of a file, else borrows those of this one. Returns its
+    bin folder."""
     venv.create(folder, with_pip=True, symlinks=True)
-    python = folder / "bin" / "python"
-    options = ["--constraint", str(ROOT / "constraints.txt")] if with_dependencies else ["--no-deps"]
-    subprocess.run([python, "-m", "pip", "install", "--quiet", *options, wheel], check=True)
-    if not with_dependencies:
+    python, locked = folder / "bin" / "python", ["--constraint", str(ROOT / "constraints.txt")]
+    if requirements is not None:
+        subprocess.run([python, "-m", "pip", "install", "--quiet", *locked, "--requirement", requirements], check=True)
+    subprocess.run([python, "-m", "pip", "install", "--quiet", *(locked if with_dependencies else ["--no-deps"]), wheel], check=True)
+    if not with_dependencies and requirements is None:
         site = subprocess.run([python, "-c", "import sysconfig; print(sysconfig.get_path('purelib'))"], capture_output=True, text=True, check=True)
         borrowed = Path(site.stdout.strip()) / "borrowed.pth"
         borrowed.write_text(f"import sys; sys.path.append({sysconfig.get_path('purelib')!r})\n")
@@ -148,3 +150,12 @@ def test_wheel_with_its_own_dependencies(wheel, tmp_path):
     check_installation(programs, tmp_path / "elsewhere")
     run_five_frames(programs, tmp_path / "elsewhere")
     assert len([line for line in (tmp_path / "elsewhere" / "five" / "trajectory.txt").read_text().splitlines() if line[0] != "#"]) == 5
+
+
+@pytest.mark.slow
+def test_wheel_with_the_minimal_requirements(wheel, tmp_path):
+    """The default graph runs, and what needs another library names it."""
+    programs = installed(wheel, tmp_path / "env", with_dependencies=False, requirements=ROOT / "requirements-minimal.txt")
+    run_five_frames(programs, tmp_path, "outputs=[trajectory,surface]")
+    done = subprocess.run([programs / "trihedron", "run", "planes=open3d_ransac"], cwd=tmp_path, capture_output=True, text=True)
+    assert (done.returncode, done.stderr.splitlines()[-1]) == (1, "trihedron: open3d: is not installed; install it with: pip install open3d")

@@ -124,7 +124,7 @@ def report_names(slots: list[dict[str, Any]], broken: dict[str, str]) -> str:
     """Format the slots for people: a line of names each, then a line for each package that does not load, with its error."""
     names = [[slot["name"], ", ".join("*" * plugin["default"] + plugin["name"] for plugin in slot["plugins"])] for slot in slots]
     lines = [table(names, "ll"), "", "trihedron plugins SLOT describes each, trihedron plugins SLOT PLUGIN its options"]
-    return "\n".join([*lines, *(f"broken: {package} does not load: {cause}; mend it or uninstall it" for package, cause in broken.items())])
+    return "\n".join([*lines, *(f"broken: {package} does not load: {cause}" for package, cause in broken.items())])
 
 
 def report(slot: dict[str, Any]) -> str:

@@ -21,7 +21,7 @@ from trihedron.pipeline.app.compilation import compile_once
 from trihedron.pipeline.app.trajectory_plot import PLOT, trajectory_figure
 from trihedron.pipeline.app.viewers import Viewer, opened_viewer
 from trihedron.pipeline.core.config import Feedback, graph_of
-from trihedron.pipeline.core.errors import ConfigError, DataError, RecordingError, did_you_mean, printable
+from trihedron.pipeline.core.errors import ConfigError, DataError, LibraryError, RecordingError, did_you_mean, printable
 from trihedron.pipeline.core.files import sha256_of
 from trihedron.pipeline.core.graph import Graph
 from trihedron.pipeline.core.overrides import literal_text, path_of, quote
@@ -265,7 +265,10 @@ def write_files(
             final = results.final_trajectory(result)
             metrics = results.write_results(out, result, final, truth)
             if plot and len(final) > 1:
-                trajectory_figure(final, truth, out / PLOT, [(pose.stamp_ns, pose.status) for pose in result.poses])
+                try:
+                    trajectory_figure(final, truth, out / PLOT, [(pose.stamp_ns, pose.status) for pose in result.poses])
+                except LibraryError as error:
+                    print(f"trihedron: warning: {PLOT} is not drawn: {error}", file=sys.stderr)
         results.write_json(out / results.TIMING, timing)
     except OSError as error:
         raise DataError(str(error.filename or out), f"cannot be written: {error.strerror}", "make room, or give another out=FOLDER") from error

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.files import new_file
 from trihedron.pipeline.core.geometry import nearest_rotation, transform, umeyama
+from trihedron.pipeline.core.libraries import imports_of
 from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import DEGRADED, F64, LOST, Trajectory
 from trihedron.pipeline.run.metrics import FEWEST_POSES, associate, rotation_angles_deg
@@ -28,8 +29,10 @@ def trajectory_figure(estimate: Trajectory, truth: Trajectory | None, path: Path
     """Write a PNG: the trajectory over its two widest axes, the position per axis or, with truth, the errors per axis and of the rotation.
 
     The estimate is aligned to the truth (SE(3)). `status` are (stamp_ns, ok | degraded | lost) of all frames; those that are not ok are marked.
-    Truth that has fewer than 3 stamps in common is skipped. Raises DataError when the file cannot be written."""
-    from matplotlib.figure import Figure
+    Truth that has fewer than 3 stamps in common is skipped. Raises DataError when the file cannot be written,
+    LibraryError without matplotlib."""
+    with imports_of("matplotlib"):
+        from matplotlib.figure import Figure
 
     pairs = associate(estimate.stamps_ns, truth.stamps_ns) if truth is not None else np.empty((0, 2), np.int64)
     figure = Figure(figsize=(11, 8))

@@ -238,6 +238,8 @@ def rewrite_error(error: Exception) -> TrihedronError:
     """Rewrite an error that Hydra or OmegaConf raises while composing as one line with place, cause and cure."""
     text = " ".join(str(error).split())
     cause: BaseException = error.__cause__ or error
+    if isinstance(cause, ModuleNotFoundError) and cause.name:
+        return library_error(cause.name.partition(".")[0], cause)
     if match := re.search(r"Ambiguous value for argument '([^=']*)=([^']*)'", text):
         return UsageError(match[1], f"'{match[2]}' is several values", "add -m to run once with each, or write a list as [A,B]")
     if isinstance(error, OverrideParseException):

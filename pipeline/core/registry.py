@@ -13,7 +13,7 @@ import pkgutil
 import sys
 import threading
 from collections.abc import Callable
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import entry_points
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
@@ -22,6 +22,7 @@ import numpy as np
 
 from trihedron.pipeline.core.drawings import Drawing
 from trihedron.pipeline.core.errors import PluginError, TrihedronError, did_you_mean, printable
+from trihedron.pipeline.core.libraries import library_error
 from trihedron.pipeline.core.options import check_options
 from trihedron.pipeline.core.slots import FOLDS, RESERVED, SLOTS, inputs_of, method_of, output_of, strip_none
 from trihedron.pipeline.core.types import F64, Pose, Value
@@ -33,7 +34,7 @@ _PLUGINS: dict[str, dict[str, type[Any]]] = {slot: {} for slot in SLOTS}
 _BUILT_IN = ("trihedron.datasets", "trihedron.plugins")
 HOMES = {"dataset": ("trihedron.datasets.readers", "trihedron.datasets.simulation", "trihedron.datasets.faults")}
 ENTRY_POINT_GROUP = "trihedron.plugins"
-_BROKEN: dict[EntryPoint, str] = {}  # packages of plugins that do not load, and why
+_BROKEN: dict[str, str] = {}  # packages and modules of plugins that do not load, and why
 _LOADING = threading.RLock()
 FileWriter = Callable[[Path, Any], list[str]]
 _FILES: dict[str, FileWriter] = {}
@@ -241,11 +242,17 @@ def _load_built_in() -> None:
     for package in _BUILT_IN:
         root = importlib.import_module(package)
         for module in pkgutil.walk_packages(root.__path__, package + "."):
-            importlib.import_module(module.name)
+            try:
+                importlib.import_module(module.name)
+            except ModuleNotFoundError as error:
+                library = str(error.name).partition(".")[0]
+                if library == "trihedron":
+                    raise
+                _BROKEN[f"what needs {library}"] = str(library_error(library, error))
 
 
 def load_plugins() -> None:
-    """Import every built-in plugin, and those of packages (`load_packages`)."""
+    """Import every built-in plugin, and those of packages (`load_packages`). A module whose library is not installed is left out."""
     with _LOADING:
         _load_built_in()
         load_packages()
@@ -257,21 +264,19 @@ def load_packages() -> None:
     with _LOADING:
         importlib.import_module("trihedron.plugins.renamed")
         for entry in entry_points(group=ENTRY_POINT_GROUP):
-            if entry in _BROKEN:
+            package = f"{entry.dist.name if entry.dist else entry.name} ({entry.value})"
+            if package in _BROKEN:
                 continue
             try:
                 entry.load()
             except (Exception, SystemExit) as error:
                 cause = str(error) if isinstance(error, TrihedronError) else f"{type(error).__name__}: {error}"
-                _BROKEN[entry] = printable(cause)
-                line = f"plugin package {_package_of(entry)}: does not load: {_BROKEN[entry]}; it is left out until you mend or uninstall it"
+                _BROKEN[package] = printable(cause)
+                line = f"plugin package {package}: does not load: {_BROKEN[package]}; it is left out until you mend or uninstall it"
                 print(f"trihedron: warning: {line}", file=sys.stderr)
 
 
 def broken_packages() -> dict[str, str]:
-    """Return each installed package of plugins that does not load, with its module, and why; call `load_packages` first."""
-    return {_package_of(entry): cause for entry, cause in _BROKEN.items()}
-
-
-def _package_of(entry: EntryPoint) -> str:
-    return f"{entry.dist.name if entry.dist else entry.name} ({entry.value})"
+    """Return each package of plugins, with its module, that does not load, and what needs a library that is not installed, and why; call
+    `load_plugins` first."""
+    return dict(_BROKEN)

@@ -134,7 +134,7 @@ def test_a_plugin_package_that_does_not_load_disables_only_itself(monkeypatch, c
     broken, exits, entries = Entry(), Entry(), []
     broken.error, exits.error, exits.value = ImportError("No module named 'mine'"), SystemExit(3), "other"
     loads = Entry()
-    loads.load = lambda: entries.append("loaded")
+    loads.value, loads.load = "whole", lambda: entries.append("loaded")
     monkeypatch.setattr(registry, "_BROKEN", {})
     monkeypatch.setattr(registry, "entry_points", lambda group: [broken, exits, loads])
     registry.load_plugins()
@@ -153,6 +153,16 @@ def test_a_plugin_package_that_does_not_load_disables_only_itself(monkeypatch, c
         "it may be in mine (mine.plugins), which does not load: ImportError: No module named 'mine'; "
         "it may be in mine (other), which does not load: SystemExit: 3"
     )
+
+
+def test_a_built_in_module_whose_library_is_missing_is_left_out():
+    """In an installation of the packages in requirements-minimal.txt."""
+    code = (
+        "import sys; sys.modules['mcap_ros2'] = None; sys.modules['mcap_ros2.decoder'] = None; from trihedron.pipeline.core import registry; "
+        "registry.load_plugins(); found = registry.plugins_of('dataset'); print('tum' in found, 'mcap' in found, registry.broken_packages())"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)
+    assert done.stdout.startswith("True False {'what needs mcap_ros2': 'mcap-ros2-support: "), done.stderr
 
 
 def test_every_built_in_plugin_is_found_by_its_name_alone(monkeypatch):

@@ -1,11 +1,13 @@
 """The picture of a run: that it is there, and that it shows what it is given."""
 
+import sys
+
 import cv2
 import numpy as np
 import pytest
 
 from trihedron.pipeline.app import trajectory_plot as plot
-from trihedron.pipeline.core.errors import DataError
+from trihedron.pipeline.core.errors import DataError, LibraryError
 from trihedron.pipeline.core.geometry import pose_matrix
 from trihedron.pipeline.core.lie import exp_se3, exp_so3
 from trihedron.pipeline.core.types import DEGRADED, LOST, OK, Trajectory
@@ -77,3 +79,10 @@ def test_a_folder_that_is_not_there(tmp_path):
     with pytest.raises(DataError) as error:
         plot.trajectory_figure(circle(), None, tmp_path / "no" / "t.png")
     assert str(error.value) == f"{tmp_path / 'no' / 't.png'}: cannot be written: No such file or directory; give another folder"
+
+
+def test_a_run_without_matplotlib_says_that_it_draws_no_picture(monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    with pytest.raises(LibraryError, match=r"^matplotlib: "):
+        plot.trajectory_figure(circle(), None, tmp_path / "t.png")
+    assert not (tmp_path / "t.png").exists()
