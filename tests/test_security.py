@@ -340,6 +340,18 @@ def test_numbers_of_another_program_beyond_any_place_are_refused(tmp_path):
     assert str(caught.value) == f"{tmp_path}/far.txt:2: a number is beyond 1e+09; each line holds the 12 numbers of a pose, metres"
 
 
+def test_a_covariance_whose_square_is_infinite_is_refused(tmp_path, capsys):
+    """It is finite, and what is computed of it printed warnings of NumPy."""
+    writer = RecordingWriter(tmp_path / "run.mcap", {"overrides": "[]"})
+    writer.write("frames", FrameReference(0, 0, Camera(8, 6, 4.0, 4.0, 3.5, 2.5)))
+    writer.write("pose", Pose(0, 0, np.eye(4), np.full((6, 6), 1.79e308), np.eye(4), -1, np.zeros(3, np.int32), 0, "ok", ""))
+    writer.close()
+    assert main(["evaluate", str(tmp_path / "run.mcap"), "--no-reference"]) == 1
+    place = f"{tmp_path}/run.mcap: topic /pose, frame 0"
+    line = f"trihedron: {place}: the field 'covariance' holds numbers beyond 1e+100; the file is damaged; record it again\n"
+    assert capsys.readouterr().err == line
+
+
 LINKED = ("run.mcap", "trajectory.txt", "trajectory_causal.txt", "metrics.json", "timing.json", "surface.ply")
 LINKED_BUILDING = ("building.json", "floorplan.svg", "floorplan.dxf", "building.glb")
 

@@ -41,7 +41,7 @@ def main(argv: list[str]) -> int:
     folders, files = [path for path in options.folders if not path.is_file()], [path for path in options.folders if path.is_file()]
     if options.surfaces:
         judge_surfaces(folders)
-    runs = [run for folder in folders for run in read_runs(folder)]
+    runs = read_runs(*folders)
     found = verdicts_against(runs, options.baseline)
     rows = with_verdicts(rows_of(runs + read_trajectories(files, runs, options.label, options.y_up), options.baseline), found)
     lines = [line_of(one, COLUMNS[one.figure]) for one in found]

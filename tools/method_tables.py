@@ -20,14 +20,13 @@ from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from trihedron.comparison.attribution import nees_of
 from trihedron.comparison.fold_measures import Measures
 from trihedron.comparison.runs import judge_surfaces, run_folders
-from trihedron.pipeline.core.errors import DataError, TrihedronError
+from trihedron.pipeline.core.errors import TrihedronError
 from trihedron.pipeline.core.files import write_file
 from trihedron.pipeline.core.text_table import table
+from trihedron.pipeline.run.result_files import read_results, read_words
 from trihedron.pipeline.run.results import METRICS, TIMING
 from trihedron.pipeline.sweep.sweep import GRAPH_KEYS, is_graph_word
 from trihedron.tools import own_measures
@@ -62,16 +61,13 @@ def main(argv: list[str]) -> int:
 
 def row_of(folder: Path) -> Row:
     """The figures of a run. Raises DataError when its files cannot be read."""
-    try:
-        words = yaml.safe_load((folder / ".hydra" / "overrides.yaml").read_text()) or []
-        metrics, timing, job = (_read(folder / name) for name in (METRICS, TIMING, "job.json"))
-    except (OSError, ValueError) as error:
-        raise DataError(str(folder), f"cannot be read: {error}", "run it again") from error
+    words = read_words(folder / ".hydra" / "overrides.yaml")
+    metrics, timing, job = (read_results(folder / name) for name in (METRICS, TIMING, "job.json"))
     of_data = list(takewhile(lambda word: word.lstrip("+").startswith("dataset") or is_graph_word(word), words))
     changes = [word for word in words[len(of_data) :] if word.partition("=")[0] in GRAPH_KEYS]
     change = " ".join(changes) or DEFAULT
-    final, status = metrics.get("final", {}), metrics.get("status", {})
-    tracked = sum(status.get(name, 0) for name in ("ok", "degraded")) / max(metrics.get("frames", 0), 1)
+    final, status = metrics.get("final") or {}, metrics.get("status") or {}
+    tracked = sum(status.get(name) or 0 for name in ("ok", "degraded")) / max(metrics.get("frames") or 0, 1)
     stage = timing.get("stages", {}).get(change.partition("=")[0], {})
     done = job.get("state", "done") == "done" and metrics
     return {
@@ -177,11 +173,6 @@ def cell_of(row: Row | None) -> str:
     if row["ate_mm"] is None:
         return share
     return f"{row['ate_mm']:.1f}" + ("" if row["tracked"] > 0.999 else f" ({share})")
-
-
-def _read(file: Path) -> Row:
-    found: Row = json.loads(file.read_text()) if file.exists() else {}
-    return found
 
 
 def _round_value(value: float | None) -> float | None:

@@ -78,7 +78,7 @@ def main(argv: list[str]) -> int:
 
 def known_of(folders: Sequence[Path]) -> Known:
     """Return the cells of the runs in some folders. Raises DataError when there are none."""
-    runs = [run for folder in folders for run in read_runs(folder)]
+    runs = read_runs(*folders)
     return [(facts_of(same[0]), row_of(data, change, same)) for (data, change), same in groups_of(runs).items()]
 
 
@@ -121,8 +121,8 @@ def time_table(known: Known) -> Table | None:
         stages = timing.get("stages", {})
         if facts.graph not in ("structural", WITH) or not stages:
             continue
-        groups = [sum(stages.get(name, {}).get("p50_ms") or 0.0 for name in names) for names in STAGE_GROUPS.values()]
-        total = timing.get("frame_ms", {}).get("p50")
+        groups = [sum((stages.get(name) or {}).get("p50_ms") or 0.0 for name in names) for names in STAGE_GROUPS.values()]
+        total = (timing.get("frame_ms") or {}).get("p50")
         rows.append((f"{facts.graph}, {_data(facts)}", *(f"{ms:.1f}" for ms in groups), NONE if total is None else f"{total:.1f}"))
     if not rows:
         return None

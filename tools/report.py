@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from trihedron.comparison import run_tables
-from trihedron.comparison.runs import Run, read_runs, rows_of
+from trihedron.comparison.runs import OVERRIDES, Run, read_runs, rows_of
 from trihedron.pipeline.core.errors import DataError, TrihedronError
 from trihedron.pipeline.core.files import write_file
 from trihedron.pipeline.run.result_files import read_results
@@ -23,7 +23,7 @@ from trihedron.pipeline.run.results import flatten_dict
 from trihedron.pipeline.run.stated_sigma import CAUSES, dominant_cause
 from trihedron.tools.arguments import Parser
 from trihedron.tools.pages import render
-from trihedron.tools.run_pages import CONFIGURATION, MOST_PICTURES, RECORDING, TRAJECTORY, RunFacts, drawings_of, facts_of, frame_picture
+from trihedron.tools.run_pages import MOST_PICTURES, RECORDING, TRAJECTORY, RunFacts, drawings_of, facts_of, frame_picture
 
 TITLE_NAMES = 6
 MOST_TRIANGLES = 40_000  # of the page's one surface
@@ -36,7 +36,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--out", type=Path, default=Path("report.html"), metavar="FILE", help="default report.html")
     parser.add_argument("--title", metavar="TEXT", help="default: the data set and the names of the runs")
     options = parser.parse_args(argv)
-    runs = [run for folder in options.folders for run in read_runs(folder)]
+    runs = read_runs(*options.folders)
     write_file(options.out, page(runs, options.title))
     print(options.out)
     return 0
@@ -76,7 +76,7 @@ def _names(runs: Sequence[Run]) -> list[str]:
 
 def _origin(name: str, facts: RunFacts) -> tuple[str, ...]:
     """Name, data set, date and command of a run."""
-    date = datetime.fromtimestamp((facts.run.folder / CONFIGURATION).stat().st_mtime).astimezone().strftime("%Y-%m-%d %H:%M %Z")
+    date = datetime.fromtimestamp((facts.run.folder / OVERRIDES).stat().st_mtime).astimezone().strftime("%Y-%m-%d %H:%M %Z")
     return name, facts.data_set, date, shlex.join(["trihedron", "run", *facts.words])
 
 

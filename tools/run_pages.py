@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -65,14 +64,19 @@ class RunFacts:
     frames: int
 
     @property
+    def _dataset(self) -> dict[str, Any]:
+        found = self.config.get("dataset")
+        return found if isinstance(found, dict) else {}
+
+    @property
     def folder_name(self) -> str:
         """Return the name of the data set's folder; empty for the synthetic room."""
-        return Path(str((self.config.get("dataset") or {}).get("path") or "")).name
+        return Path(str(self._dataset.get("path") or "")).name
 
     @property
     def data_set(self) -> str:
         """Return the data set's plugin and folder."""
-        return f"{(self.config.get('dataset') or {}).get('plugin', '')} {self.folder_name}".strip() or "unknown"
+        return f"{self._dataset.get('plugin', '')} {self.folder_name}".strip() or "unknown"
 
     @property
     def graph(self) -> str:
@@ -94,12 +98,12 @@ def facts_of(run: Run) -> RunFacts:
     words = [f"{key}={value}" for key, value in run.overrides.items()]
     commit = version = ""
     try:
-        metadata = Recording(run.folder / RECORDING).metadata
-        commit, version = metadata.get("commit", ""), metadata.get("version", "")
-        words = json.loads(metadata["overrides"])
-    except (DataError, RecordingError, KeyError, ValueError):
+        recording = Recording(run.folder / RECORDING)
+        commit, version = recording.metadata.get("commit", ""), recording.metadata.get("version", "")
+        words = recording.overrides()
+    except (DataError, RecordingError):
         pass  # a run that failed has none, or a broken one
-    return RunFacts(run, commit, version, tuple(map(str, words)), config, metrics.get("frames") or 0)
+    return RunFacts(run, commit, version, tuple(words), config, metrics.get("frames") or 0)
 
 
 @dataclass(frozen=True)

@@ -75,7 +75,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--write-band", type=Path, metavar="BAND", help="write the band of these runs")
     parser.add_argument("--no-pictures", action="store_true", help="leave out the pictures of frames")
     options = parser.parse_args(argv)
-    cells = cells_of([run for folder in options.folders for run in read_runs(folder)])
+    cells = cells_of(read_runs(*options.folders))
     outside = band_failures(read_band(options.check), cells) if options.check else {}
     write_site(cells, options.out, options.title, outside, not options.no_pictures, ablations_of(options.folders))
     if options.write_band:

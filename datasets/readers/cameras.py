@@ -94,7 +94,7 @@ def read_camera_file(path: Path) -> Calibration:
     except YamlError as error:
         raise DataError(
             f"{path}:{error.line}" if error.line else str(path),
-            "is not YAML" if error.__cause__ else "holds aliases or deep nesting",
+            "is not YAML" if error.__cause__ else f"holds {str(error).removeprefix('with ')}",
             "write one 'key: value' a line",
         ) from error
     if not isinstance(content, dict):

@@ -10,7 +10,7 @@ import numpy as np
 from imagecodecs import png_decode
 from numpy.typing import NDArray
 
-from trihedron.datasets.readers.picture_headers import JPEG, PNG, UnreadableImage, is_whole_png, picture_header
+from trihedron.datasets.readers.picture_headers import JPEG, PNG, UnreadableImage, picture_header, png_pixels
 from trihedron.pipeline.core.errors import DataError, printable
 from trihedron.pipeline.core.files import SHOWN, read_file
 from trihedron.pipeline.core.types import F32, U8
@@ -71,13 +71,14 @@ def decode_image(data: bytes) -> NDArray[Any]:
     header = picture_header(data)
     if header.cells > min(PIXELS_PER_BYTE * len(data), MAX_PIXELS):
         raise UnreadableImage(f"claims {header.width}×{header.height} pixels in {len(data)} bytes")
-    if (data.startswith(PNG) and not is_whole_png(data)) or (data.startswith(JPEG) and JPEG_END not in data[-TAIL:]):
+    pixels = png_pixels(data) if data.startswith(PNG) else None
+    if (data.startswith(PNG) and pixels is None) or (data.startswith(JPEG) and JPEG_END not in data[-TAIL:]):
         raise UnreadableImage("is truncated")
     try:
-        image = _decode_png(data, header.channels) if data.startswith(PNG) else _decode_opencv(data, header.channels)
+        image = _decode_png(pixels, header.channels) if pixels is not None else _decode_opencv(data, header.channels)
     except Exception as error:  # the decoders' own, and UnicodeDecodeError where libpng quotes a damaged name
         raise UnreadableImage(f"is damaged ({printable(str(error), SHOWN)})") from error
-    if image is None:
+    if image is None or image.shape[:2] != (header.height, header.width):
         raise UnreadableImage("is damaged or of an unknown format")
     return image
 

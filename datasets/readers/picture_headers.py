@@ -12,8 +12,10 @@ from dataclasses import dataclass
 PNG, JPEG, BMP = b"\x89PNG", b"\xff\xd8\xff", b"BM"
 PNG_START = b"\x89PNG\r\n\x1a\n" + struct.pack(">I4s", 13, b"IHDR")
 TIFFS = {b"II*\0": "<", b"MM\0*": ">"}  # little and big endian
-COMMENT = re.compile(rb"#[^\n]*(?:\n|$)")  # of a PNM
+BLANK = rb"\s(?:\s|#[^\r\n]*\n)*"  # of a PNM; decoders disagree on a comment that begins behind a digit, or ends with \r
+PNM = re.compile(rb"P([1-6])" + BLANK + rb"(\d{1,9})" + BLANK + rb"(\d{1,9})(?:" + BLANK + rb"(\d{1,9}))?\s")
 PNM_HEAD = 4096  # bytes that hold the header of a PNM with its comments
+ANCILLARY = 0x20  # bit of the first letter of a PNG chunk's name
 FRAME_MARKS = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # of a JPEG: segments that hold its size
 TIFF_WIDTH, TIFF_HEIGHT, TIFF_BITS, TIFF_SAMPLES, TIFF_TILE_WIDTH, TIFF_TILE_HEIGHT = 256, 257, 258, 277, 322, 323
 TIFF_FORMATS = {1: "B", 3: "H", 4: "I"}
@@ -51,17 +53,21 @@ def picture_header(data: bytes) -> PictureHeader:
     return header
 
 
-def is_whole_png(data: bytes) -> bool:
-    """Return True for a PNG whose chunks, the header first, lie within its bytes: a decoder allocates a chunk before it reads it."""
+def png_pixels(data: bytes) -> bytes | None:
+    """Return a PNG without the chunks that say nothing of its pixels, which may unpack to gigabytes of text; None for one whose chunks, the header
+    first, do not lie within its bytes: a decoder allocates a chunk before it reads it."""
     if not data.startswith(PNG_START):
-        return False
-    at = len(PNG_START) - 8
+        return None
+    at, kept = len(PNG_START) - 8, [data[:8]]
     while at + 12 <= len(data):
         length, name = struct.unpack_from(">I4s", data, at)
+        end = at + 12 + length  # with name and checksum
+        if not name[0] & ANCILLARY or name == b"tRNS":
+            kept.append(data[at:end])
         if name == b"IEND":
-            return bool(at + 12 + length <= len(data))
-        at += 12 + length  # with name and checksum
-    return False
+            return b"".join(kept) if end <= len(data) else None
+        at = end
+    return None
 
 
 def _png(data: bytes) -> PictureHeader:
@@ -89,13 +95,11 @@ def _bmp(data: bytes) -> PictureHeader:
 
 def _pnm(data: bytes) -> PictureHeader | None:
     """The header is words between blanks and comments: kind, width, height and, but for bitmaps, the largest value."""
-    words = COMMENT.sub(b" ", data[:PNM_HEAD]).split(maxsplit=4)
-    bitmap = words[:1] in ([b"P1"], [b"P4"])
-    numbers = words[1 : 3 if bitmap else 4]
-    if len(words) < (3 if bitmap else 4) or not re.fullmatch(rb"P[1-6]", words[0]) or not all(word.isdigit() and len(word) <= 9 for word in numbers):
+    found = PNM.match(data[:PNM_HEAD])
+    if found is None or (found[1] not in b"14" and found[4] is None):
         return None
-    width, height, largest = (*map(int, numbers), 1)[:3]
-    return PictureHeader(width, height, 1 if bitmap else 16 if largest > 255 else 8, 3 if words[0] in (b"P3", b"P6") else 1)
+    bits = 1 if found[1] in b"14" else 16 if int(found[4]) > 255 else 8
+    return PictureHeader(int(found[2]), int(found[3]), bits, 3 if found[1] in b"36" else 1)
 
 
 def _tiff(data: bytes) -> PictureHeader | None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 import errno
 import hashlib
 import os
+import re
 import stat
 import tempfile
 from collections.abc import Iterator
@@ -21,6 +22,7 @@ from trihedron.pipeline.core.errors import DataError, TrihedronError, printable
 MAX_NETWORK_BYTES = 2**31  # of an ONNX file, as its format has it
 MAX_YAML_BYTES = 1_000_000
 MAX_YAML_DEPTH = 20  # of nested lists and mappings
+BASE_60, LONGEST_TIME = re.compile(r"[-+\d_.:]*:[-+\d_.:]*"), 100  # to read 1:1:1:… as YAML 1.1 has it takes time with the square of its length
 SHOWN = 60  # characters of a stranger's text in a message
 STREAMS = (Path("/dev"), Path("/dev/fd"), Path("/proc/self/fd"))  # folders of devices and open files, which nothing may replace
 
@@ -134,6 +136,8 @@ def parse_yaml(text: str, max_depth: int = MAX_YAML_DEPTH) -> Any:
             depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
             if depth > max_depth or isinstance(event, yaml.AliasEvent):
                 raise YamlError("with aliases or deep nesting", event.start_mark.line + 1)
+            if isinstance(event, yaml.ScalarEvent) and len(event.value) > LONGEST_TIME and BASE_60.fullmatch(event.value):
+                raise YamlError(f"with a number a:b:c of more than {LONGEST_TIME} characters", event.start_mark.line + 1)
         return yaml.CSafeLoader(text).get_single_data()
     except YamlError:
         raise

@@ -19,6 +19,7 @@ from trihedron.pipeline.core.types import Camera, Frame, Value
 
 ORTHONORMAL = 1e-6  # of RᵀR - I, its largest element
 PREVIOUS = "previous"  # parameters that take an earlier value begin with it
+LARGEST = 1e100  # of a number; the square of one has to be finite
 UNIT = 1e-6  # of |n| - 1
 CURE = "the file is damaged; record it again"
 
@@ -164,7 +165,9 @@ def _fault_of_word(word: Any, rule: OneOf, owner: Any) -> str:
 
 
 def _fault_of_finite(array: Any, rule: Finite, owner: Any) -> str:
-    return "" if np.isfinite(array).all() else "is not finite"
+    if not np.isfinite(array).all():
+        return "is not finite"
+    return "" if float(np.abs(array).max(initial=0)) <= LARGEST else f"holds numbers beyond {LARGEST:g}"
 
 
 def _fault_of_rotations(array: Any, rule: Rotations, owner: Any) -> str:

@@ -1,4 +1,4 @@
-"""Read the JSON files of a run folder, which may be a stranger's: an object of limited size whose known keys hold what they should."""
+"""Read the files of a run folder, which may be a stranger's: JSON objects of limited size whose known keys hold what they should, and its words."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from trihedron.pipeline.core.errors import DataError, printable
-from trihedron.pipeline.core.files import SHOWN, read_text
+from trihedron.pipeline.core.files import MAX_YAML_BYTES, SHOWN, YamlError, parse_yaml, read_text
 
 MAX_BYTES = 64_000_000
 LARGEST = 1e300  # of an integer, which JSON does not limit and a float does
@@ -46,6 +46,17 @@ def read_results(path: Path) -> dict[str, Any]:
     _check(found, KINDS, path, "")
     results: dict[str, Any] = found
     return results
+
+
+def read_words(path: Path) -> list[str]:
+    """Return the words that a run was composed of, its `overrides.yaml`. Raises DataError."""
+    try:
+        words = parse_yaml(read_text(path, MAX_YAML_BYTES))
+    except YamlError as error:
+        raise DataError(str(path), f"is a text {error}", CURE) from error
+    if not isinstance(words, list):
+        raise DataError(str(path), "is not a list of words", CURE)
+    return [str(word) for word in words]
 
 
 def _check(value: Any, kind: Any, path: Path, key: str) -> None:

@@ -118,5 +118,5 @@ def flatten_dict(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     """Flatten nested dictionaries: values by dotted name, as `final.ate_rmse_m`."""
     flat: dict[str, Any] = {}
     for name, value in values.items():
-        flat |= flatten_dict(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}
+        flat |= flatten_dict(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
     return flat

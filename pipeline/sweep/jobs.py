@@ -12,8 +12,10 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
+from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.files import write_file
 from trihedron.pipeline.core.registry import ENTRY_POINT_GROUP
+from trihedron.pipeline.run.result_files import read_results
 
 JOB = "job.json"
 RUNNING, DONE, FAILED = "running", "done", "failed"
@@ -68,9 +70,8 @@ def write_job(folder: Path, key: str, state: str, error: str = "") -> None:
 
 
 def read_job(folder: Path) -> Job:
-    """Read the last state of a job; empty where there never was one."""
+    """Read the last state of a job; empty where there never was one, or it cannot be read."""
     try:
-        job: Job = json.loads((folder / JOB).read_text())
-    except (FileNotFoundError, json.JSONDecodeError):  # absent, or being written
+        return read_results(folder / JOB)
+    except DataError:  # a crash left it empty
         return {}
-    return job

@@ -27,6 +27,7 @@ from trihedron.pipeline.core.files import write_file
 from trihedron.pipeline.core.graph import Graph
 from trihedron.pipeline.core.libraries import imports_of
 from trihedron.pipeline.core.plugin_configs import PLUGIN_KEY
+from trihedron.pipeline.run.result_files import read_results
 from trihedron.pipeline.run.results import METRICS, flatten_dict
 from trihedron.pipeline.sweep.sweep import OUTCOMES, Outcome, Overrides, Sweeper, failure_of
 
@@ -213,4 +214,4 @@ def _words(values: Mapping[str, Any]) -> Overrides:
 
 def _job_metrics(file: Path) -> dict[str, float]:
     """The numbers of a job's metrics, by dotted name."""
-    return {name: value for name, value in flatten_dict(json.loads(file.read_text())).items() if isinstance(value, (int, float))}
+    return {name: value for name, value in flatten_dict(read_results(file)).items() if isinstance(value, (int, float))}

@@ -11,6 +11,7 @@ import re
 import sys
 from collections.abc import Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -27,12 +28,13 @@ from joblib.externals.loky import get_reusable_executor
 from omegaconf import DictConfig
 
 from trihedron.pipeline.core.config import graph_of, rewrite_error
-from trihedron.pipeline.core.errors import TrihedronError, UsageError, did_you_mean
+from trihedron.pipeline.core.errors import DataError, TrihedronError, UsageError, did_you_mean
 from trihedron.pipeline.core.files import make_folder, write_file
 from trihedron.pipeline.core.libraries import library_error
 from trihedron.pipeline.core.overrides import with_literal_paths
 from trihedron.pipeline.core.registry import load_plugins, options_of, plugins_of
 from trihedron.pipeline.core.slots import SLOTS
+from trihedron.pipeline.run.result_files import read_words
 from trihedron.pipeline.sweep.cluster import all_awaited
 from trihedron.pipeline.sweep.jobs import DONE, FAILED, RUNNING, key_of, read_job, write_job
 from trihedron.pipeline.sweep.preview import Planned, common_words, preview, refused_job, state_of
@@ -276,8 +278,12 @@ def plugins_alone(slot: str) -> list[str]:
 def _numbers(folder: Path, jobs: Sequence[Overrides]) -> list[int]:
     """The folder of each job: the one that has its overrides, else the next free number."""
     files = [file for file in folder.glob("*/.hydra/overrides.yaml") if file.parent.parent.name.isdigit()]
-    known = {tuple(yaml.safe_load(file.read_text()) or []): int(file.parent.parent.name) for file in files}
-    free = itertools.count(max(known.values(), default=-1) + 1)
+    numbers = [int(file.parent.parent.name) for file in files]
+    known: dict[tuple[str, ...], int] = {}
+    for file, number in zip(files, numbers):
+        with suppress(DataError):  # a crash left it empty
+            known[tuple(read_words(file))] = number
+    free = itertools.count(max(numbers, default=-1) + 1)
     return [known[tuple(job)] if tuple(job) in known else next(free) for job in jobs]
 
 

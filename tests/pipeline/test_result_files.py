@@ -1,13 +1,16 @@
 """The JSON files of run folders, which may be a stranger's."""
 
 import json
+import os
 import shutil
 
 import pytest
 
 from trihedron.pipeline.app.cli import main
 from trihedron.pipeline.core.errors import DataError
+from trihedron.pipeline.record.writer import RecordingWriter
 from trihedron.pipeline.run.result_files import read_results
+from trihedron.pipeline.sweep.jobs import read_job
 
 CURE = "run it again, or leave this folder out"
 HOSTILE = {  # name -> text, cause
@@ -66,3 +69,54 @@ def test_a_report_leaves_out_times_that_are_missing(tmp_path, run):
     shutil.copytree(run, tmp_path / "run")
     (tmp_path / "run" / "timing.json").write_text("{}")
     assert main(["report", str(tmp_path / "run"), "--out", str(tmp_path / "report.html")]) == 0
+
+
+FILES = ["metrics.json", "timing.json", "job.json", ".hydra/overrides.yaml"]
+CAUSES = {
+    "empty": "is not ",
+    "a list": "holds a value that is not an object",
+    "binary": "is not a text file",
+    "a pipe": "cannot be read (it is not a regular file)",
+}
+
+
+@pytest.mark.parametrize("file", FILES)
+@pytest.mark.parametrize("kind", CAUSES)
+def test_a_run_that_cannot_be_read_is_left_out(tmp_path, capsys, run, kind, file):
+    """As a crash leaves it, or as a stranger makes it: the others are compared all the same."""
+    shutil.copytree(run, tmp_path / "runs" / "0")
+    shutil.copytree(run, tmp_path / "runs" / "1")
+    path = tmp_path / "runs" / "1" / file
+    path.unlink(missing_ok=True)
+    if kind == "a pipe":
+        os.mkfifo(path)
+    else:
+        path.write_bytes({"empty": b"", "a list": b"[1]" if file.endswith("json") else b"{}", "binary": b"\xff\xfe"}[kind])
+    assert main(["compare", str(tmp_path / "runs")]) == 0
+    printed = capsys.readouterr()
+    cause = "is not a list of words" if kind == "a list" and file.endswith("yaml") else CAUSES[kind]
+    assert printed.err.startswith(f"trihedron: warning: {path}: {cause}") and printed.err.endswith("; this run is left out\n")
+    assert printed.err.count("\n") == 1 and len(printed.out.splitlines()) == 2  # header and one run
+
+
+@pytest.mark.parametrize("command", ["report", "site"])
+def test_pages_of_runs_with_a_hostile_one(tmp_path, capsys, run, command):
+    """Figures that are null, a configuration that is an alias bomb or has another shape, a deep list for the command."""
+    for name in ("0", "1", "2"):
+        shutil.copytree(run, tmp_path / "runs" / name)
+    nulls = {"stages": {"pose": None}, "frame_ms": None, "own_memory_mb": None}
+    (tmp_path / "runs" / "0" / "timing.json").write_text(json.dumps(nulls))
+    levels = "".join(f"{b}: &{b} [{','.join(['*' + a] * 9)}]\n" for a, b in zip("abcdefgh", "bcdefghi"))
+    (tmp_path / "runs" / "1" / ".hydra" / "config.yaml").write_text(f"a: &a [x,x,x,x,x,x,x,x,x]\n{levels}")
+    (tmp_path / "runs" / "2" / ".hydra" / "config.yaml").write_text("{dataset: [x], 1: {2: y}, graph: null}")
+    writer = RecordingWriter(tmp_path / "runs" / "2" / "run.mcap", {"overrides": "[" * 100_000})
+    writer.close()
+    out = tmp_path / "out"
+    assert main([command, str(tmp_path / "runs"), "--out", str(out)]) == 0, capsys.readouterr().err
+    assert "Traceback" not in capsys.readouterr().err
+
+
+def test_a_job_whose_state_was_cut_off_is_done_again(tmp_path):
+    for text in ("", "[]", '{"state": 3}', "[" * 100_000):
+        (tmp_path / "job.json").write_text(text)
+        assert read_job(tmp_path) == {}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -10,15 +9,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from trihedron.pipeline.core.errors import DataError
+from trihedron.pipeline.core.files import one_line_errors, parse_yaml
 from trihedron.pipeline.core.geometry import nearest_pairs, nearest_rotation
 from trihedron.pipeline.core.lie import log_so3
 from trihedron.pipeline.core.types import F64, ManhattanFrame
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import attached_truth
+from trihedron.pipeline.run.result_files import read_results
 from trihedron.plugins.shared.manhattan_frames_kernels import CUBE, nearest_equivalent
 
 RECORDING, TIMING, ERRORS_PNG = "run.mcap", "timing.json", "rotation_error.png"
@@ -100,14 +100,15 @@ def _run(recording: Recording, taken: list[str]) -> Run:
     values = [v for v in recording.values("manhattan") if isinstance(v, ManhattanFrame)]
     pairs = nearest_pairs(np.array([v.stamp_ns for v in values], np.int64), truth.stamps_ns, LARGEST_DIFFERENCE_NS)
     timing = recording.path.with_name(TIMING)
-    stages = json.loads(timing.read_text())["stages"] if timing.exists() else {}
-    p50_ms = float(stages.get("manhattan", {}).get("p50_ms", np.nan))
+    stage = (read_results(timing).get("stages") or {}).get("manhattan") or {}
+    p50_ms = float(stage.get("p50_ms") or np.nan)
     return Run(name, recording, [values[i] for i, _ in pairs], truth.poses[pairs[:, 1], :3, :3], p50_ms)
 
 
 def config_of(recording: Recording) -> Any:
-    """The composed configuration that made it."""
-    return yaml.safe_load(recording.metadata["config"])
+    """The composed configuration that made it. Raises DataError."""
+    with one_line_errors(f"{recording.path}: config"):
+        return parse_yaml(recording.metadata["config"])
 
 
 def in_view(value: ManhattanFrame) -> tuple[F64, F64]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import io
-import json
 import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -24,6 +23,7 @@ from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import attached_truth, read_trajectory
 from trihedron.pipeline.record.writer import RecordingWriter
 from trihedron.pipeline.run.metrics import MAX_DIFFERENCE_NS, frame_errors
+from trihedron.pipeline.run.result_files import read_results
 from trihedron.pipeline.sweep.search import followers
 
 ATE = "ate_rmse_m"
@@ -158,5 +158,5 @@ def replay_metrics(source: Path, stages: tuple[str, ...], out: Path) -> dict[str
         code = trihedron(["run", f"replay={source}", f"only=[{','.join(stages)}]", f"out={out}"])
     if code:
         raise StageError(f"replay of {', '.join(stages)}", (printed.getvalue().strip().splitlines() or ["failed"])[-1], "run it alone to see more")
-    metrics: dict[str, Any] = json.loads((out / "metrics.json").read_text()).get("final") or {}
+    metrics: dict[str, Any] = read_results(out / "metrics.json").get("final") or {}
     return metrics

@@ -13,6 +13,7 @@ import numpy as np
 from trihedron.comparison.surface_errors import FIGURES, SURFACE, evaluate_files
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.files import file_sha256, write_file
+from trihedron.pipeline.run.result_files import read_results
 
 BUILDING = {  # column -> key of the figures, the value where it is perfect, factor
     "walls mm": ("wall_m", 0.0, 1e3),
@@ -55,7 +56,7 @@ def _write_figures(run: Path, figures: dict[str, Any]) -> dict[str, Any]:
 
 def of_surface(run: Path) -> Measures:
     """Return the measures of a run folder's surface; empty where it was not judged."""
-    return of_surface_figures(json.loads((run / FIGURES).read_text())) if (run / FIGURES).exists() else {}
+    return of_surface_figures(figures) if (figures := read_results(run / FIGURES)) else {}
 
 
 def of_surface_figures(figures: Mapping[str, Any]) -> Measures:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -14,13 +15,13 @@ from trihedron.comparison.run_samples import COLUMNS, paired_samples
 from trihedron.comparison.run_tables import FIGURES
 from trihedron.comparison.verdicts import Sample, Verdict, line_of, verdicts_of
 from trihedron.pipeline.core.errors import DataError, UsageError, did_you_mean, printable
-from trihedron.pipeline.core.files import MAX_YAML_BYTES, YamlError, parse_yaml, read_text
-from trihedron.pipeline.run.result_files import read_results
+from trihedron.pipeline.run.result_files import read_results, read_words
 from trihedron.pipeline.sweep.jobs import SEEDS
 from trihedron.pipeline.sweep.paired_statistics import half_interval
 
 ALL_DATA = "all"  # in the place of a data set: differences over all of them
 NOT_SHOWN = ("out", "report", "experiment", "sequences", "alternatives", *SEEDS)
+OVERRIDES = Path(".hydra") / "overrides.yaml"
 SURFACE, SURFACE_FIGURES = "surface.ply", "surface.json"
 
 
@@ -48,9 +49,20 @@ def run_folders(folder: Path) -> list[Path]:
     return [file.parent.parent for file in sorted(files, key=lambda f: (len(str(f)), str(f)))]
 
 
-def read_runs(folder: Path) -> list[Run]:
-    """The runs in a folder. Raises DataError when it holds none."""
-    return [_run(found) for found in run_folders(folder)]
+def read_runs(*folders: Path) -> list[Run]:
+    """The runs in folders; one whose files cannot be read is reported and left out. Raises DataError for a folder without runs, and where none is
+    left."""
+    runs, refused = [], []
+    for folder in [run for given in folders for run in run_folders(given)]:
+        try:
+            runs.append(_run(folder))
+        except DataError as error:
+            refused.append(error)
+    if not runs:
+        raise refused[0]
+    for one in refused:
+        print(f"trihedron: warning: {DataError(one.place, one.cause, 'this run is left out')}", file=sys.stderr)
+    return runs
 
 
 def read_trajectories(files: Sequence[Path], runs: Sequence[Run], labels: Sequence[str] = (), y_up: bool = False) -> list[Run]:
@@ -67,23 +79,12 @@ def read_trajectories(files: Sequence[Path], runs: Sequence[Run], labels: Sequen
 
 
 def _run(folder: Path) -> Run:
-    overrides = dict(text.lstrip("+~").partition("=")[::2] for text in _words(folder / ".hydra" / "overrides.yaml"))
+    overrides = dict(printable(word).lstrip("+~").partition("=")[::2] for word in read_words(folder / OVERRIDES))
     metrics, timing, job = (read_results(folder / name) for name in ("metrics.json", "timing.json", "job.json"))
     if job.get("state", "done") != "done":
         return Run(folder, overrides, dict.fromkeys(FIGURES, np.nan), str(job.get("error") or "was stopped before its end"))
     figures = _figures_in_units(metrics, timing, read_results(folder / SURFACE_FIGURES))
     return Run(folder, overrides, figures, str(metrics.get("note", "")) if metrics or timing else "holds no results")
-
-
-def _words(file: Path) -> list[str]:
-    """The words that a run was composed of. Raises DataError."""
-    try:
-        words = parse_yaml(read_text(file, MAX_YAML_BYTES))
-    except YamlError as error:
-        raise DataError(str(file), f"is a text {error}", "run it again, or leave this folder out") from error
-    if not isinstance(words, list):
-        raise DataError(str(file), "is not a list of words", "run it again, or leave this folder out")
-    return [printable(str(word)) for word in words]
 
 
 def _figures_in_units(metrics: dict[str, Any], timing: dict[str, Any], surface: dict[str, Any]) -> dict[str, float]:
