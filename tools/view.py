@@ -1,8 +1,11 @@
 """Open a run in rerun: frames, features, planes, axes, the map, the surface and the estimate against the truth.
 
-Needs rerun: pip install 'trihedron[view]'. `trihedron export RUN --to rerun` writes the same to a file.
+Needs rerun: pip install 'trihedron[view]'. Of a recording that is being written it
+shows what there is. --web serves it to a browser until Ctrl-C, and needs no display.
+`trihedron export RUN --to rerun` writes the same to a file.
 
 Example: trihedron view runs/latest
+Example: trihedron view runs/latest --web
 """
 
 from __future__ import annotations
@@ -10,30 +13,40 @@ from __future__ import annotations
 from pathlib import Path
 
 from trihedron.pipeline.app.recorded_values import open_recording
+from trihedron.pipeline.app.viewers import keep_serving
 from trihedron.pipeline.core.errors import UsageError
 from trihedron.tools.arguments import Parser
 from trihedron.tools.export import RECORDING
 
 
 def main(argv: list[str]) -> int:
-    """Run the command; returns the exit code. Raises LibraryError without rerun, UsageError where its window does not open, RecordingError for a
-    file that cannot be read."""
+    """Run the command; returns the exit code. Raises LibraryError without rerun, UsageError where there is no display, ConfigError where nothing
+    opens, RecordingError for a file that cannot be read."""
+    from trihedron.pipeline.record.foxglove_server import LOOPBACK
     from trihedron.pipeline.record.rerun_view import require_rerun
+    from trihedron.pipeline.record.rerun_viewer import PORT, WEB_PORT, lacks_display, opened_rerun
     from trihedron.tools.export_rerun import show
 
     parser = Parser("view", __name__)
     parser.add_argument("run", metavar="RUN", type=Path, help="a run folder or its recording")
-    run: Path = parser.parse_args(argv).run
-    rerun = require_rerun()
+    parser.add_argument("--web", action="store_true", help="serve it to a browser")
+    parser.add_argument("--host", default=LOOPBACK, help="the address to listen on (default: 127.0.0.1, this machine alone)")
+    parser.add_argument("--port", type=int, default=PORT, help="of the data (default: 9876)")
+    parser.add_argument("--web-port", type=int, default=WEB_PORT, help="of the page (default: 9090)")
+    arguments = parser.parse_args(argv)
+    run: Path = arguments.run
+    require_rerun()
     recording = open_recording(run / RECORDING if run.is_dir() else run)
-    stream = rerun.RecordingStream("trihedron")
-    try:
-        stream.spawn()
-        count = show(recording, stream)
-        stream.flush()
-    except RuntimeError as error:  # there is no display, for example
-        raise UsageError(
-            "rerun", f"its window does not open: {str(error).strip().splitlines()[0]}", f"write a file instead: trihedron export {run} --to rerun"
-        ) from error
-    print(f"{count} frames of {recording.path}")
+    if lacks_display() and not arguments.web:
+        raise UsageError("view", "there is no display for rerun's window", f"serve it to a browser: trihedron view {run} --web")
+    with opened_rerun(arguments.host, arguments.port, arguments.web_port if arguments.web else None) as viewer:
+        try:
+            print(f"{show(recording, viewer.stream)} frames of {recording.path}")
+            viewer.stream.flush()
+        except RuntimeError as error:  # the window was closed, for example
+            raise UsageError(
+                "rerun", f"does not take the run: {str(error).strip().splitlines()[0]}", f"write a file instead: trihedron export {run} --to rerun"
+            ) from error
+        if viewer.url:
+            keep_serving(viewer.url)
     return 0

@@ -57,7 +57,8 @@ Usage: trihedron run [-m] [key=value ...]
   replay=FILE.mcap only=[STAGE,...]  compute these stages again, read the rest from a recording
   save_map=FILE.mcap                 keep the map, to go on from    load_map=FILE.mcap  go on from it, or find the camera in it
   localise_only=true                 the loaded map stays as it is
-  view=foxglove | view=rerun         watch the run; view.port=8765; view.web=true serves rerun to a browser
+  view=foxglove | view=rerun         watch the run; view.web=true serves rerun to a browser; view.port=8765, view.host=127.0.0.1
+                                     what is served stays until Ctrl-C, with view.keep=false it ends with the run
   live=true                          play the data set in real time; frames that come while it is busy are dropped, latency is reported
   real_time=true                     the same without dropping any
   feedback=recorded                  each recomputed stage by itself: all its inputs are as recorded
@@ -188,7 +189,7 @@ def _run(words: list[str]) -> int:
 
         check_added(words)
         return _sweep(words, _recorded_config(words))
-    run_once(words, _BEGAN)
+    run_once(words, _BEGAN, keep=True)
     return 0
 
 
@@ -235,8 +236,9 @@ def _data_set(word: str) -> list[str]:
     return words
 
 
-def run_once(words: list[str], began: float) -> tuple[Path, dict[str, Any]]:
-    """Make one run of these words, which began at a time (perf_counter). Returns its folder and its metrics. Raises TrihedronError."""
+def run_once(words: list[str], began: float, keep: bool = False) -> tuple[Path, dict[str, Any]]:
+    """Make one run of these words, which began at a time (perf_counter), and keep its viewer if `keep`, as `execute` does. Returns its folder and its
+    metrics. Raises TrihedronError."""
     with memory.gc_paused():
         from trihedron.pipeline.core.config import check_added, compose_run, rewrite_error
 
@@ -252,10 +254,7 @@ def run_once(words: list[str], began: float) -> tuple[Path, dict[str, Any]]:
     except Exception as error:  # an interpolation of the user's that leads nowhere
         raise rewrite_error(error) from error
     config.out = literal_text(str(out))  # with the time of its beginning
-    metrics = execute(config, out, with_literal_paths(words), began)
-    if not config.replay:  # a part of a run, and no run to look at
-        _point_latest(out)
-    return out, metrics
+    return out, execute(config, out, with_literal_paths(words), began, keep)
 
 
 def _sweep(words: list[str], recorded: RecordedConfig | None) -> int:
@@ -314,8 +313,6 @@ def _task(config: DictConfig) -> float | None:
     except Exception as error:  # one job of a sweep must not stop the others, and Hydra would print its overrides
         _FAILURES.append(error)
         return None
-    if not config.replay:
-        _point_latest(out)
     return metrics["final"]["ate_rmse_m"] if "final" in metrics else None
 
 
@@ -345,14 +342,3 @@ def _recorded_config(words: list[str]) -> RecordedConfig | None:
 
     source = next((found[1] for word in reversed(words) if (found := path_of(word)) is not None and found[0] == "replay"), "")
     return recorded_config_of(Recording(source)) if source else None
-
-
-def _point_latest(out: Path) -> None:
-    """`runs/latest` beside dated run folders points at the newest."""
-    runs = next((parent for parent in out.parents if parent.name == "runs"), None)
-    if runs is not None:
-        link = runs / "latest"
-        if link.is_symlink() or not link.exists():
-            link.unlink(missing_ok=True)
-            with suppress(FileExistsError):  # another job of a sweep was quicker
-                link.symlink_to(out.relative_to(runs), target_is_directory=True)

@@ -38,7 +38,7 @@ from trihedron.pipeline.run.interrupts import defer_interrupts
 from trihedron.pipeline.run.live import Pace, shows_once
 from trihedron.pipeline.run.map_file import load_map, save_map
 from trihedron.pipeline.run.replay import TOPICS, Replay
-from trihedron.pipeline.run.run_folder import lock_folder, write_configuration
+from trihedron.pipeline.run.run_folder import lock_folder, point_latest, write_configuration
 from trihedron.pipeline.run.runner import Runner, Step
 from trihedron.pipeline.run.state import DelayLines, max_delays
 from trihedron.pipeline.run.stated_sigma import sigma_line
@@ -52,12 +52,18 @@ PLAIN_PROGRESS_SECONDS = 5.0
 MAX_THREADS = 256
 
 
-def execute(config: DictConfig, out: Path, overrides: list[str], began: float) -> dict[str, Any]:
-    """Run the configuration into folder `out`; `began` is when the program started (perf_counter). Returns the metrics.
+def execute(config: DictConfig, out: Path, overrides: list[str], began: float, keep: bool = False) -> dict[str, Any]:
+    """Run the configuration into folder `out`; `began` is when the program started (perf_counter). Returns the metrics. With `keep` a viewer that is
+    served stays after the run until the user ends it, unless `view.keep=false`.
 
     Raises TrihedronError. Whatever happens after the first frame, the recording is closed and the trajectory so far is written."""
     with opened_viewer(config) as viewer:
-        return _execute(config, out, overrides, began, viewer)
+        metrics = _execute(config, out, overrides, began, viewer)
+        if not config.replay:  # a part of a run, and no run to look at
+            point_latest(out)
+        if keep and config.get("view") is not None and config.view.keep:
+            viewer.keep()
+        return metrics
 
 
 def _execute(config: DictConfig, out: Path, overrides: list[str], began: float, viewer: Viewer) -> dict[str, Any]:

@@ -50,10 +50,12 @@ class RecordOptions:
 
 @dataclasses.dataclass
 class FoxgloveView:
-    """`view=foxglove`: a WebSocket server on this machine."""
+    """`view=foxglove`: a WebSocket server."""
 
     viewer: str = "foxglove"
     port: int = 8765
+    host: str = "127.0.0.1"  # the address to listen on: this machine alone; 0.0.0.0 lets everybody on the network look
+    keep: bool = True  # serve after the last frame too, until Ctrl-C or SIGTERM (of trihedron run; a sweep does not)
 
 
 @dataclasses.dataclass
@@ -64,6 +66,8 @@ class RerunView:
     port: int = 9876  # of the data
     web: bool = False
     web_port: int = 9090
+    host: str = "127.0.0.1"  # the address to listen on: this machine alone; 0.0.0.0 lets everybody on the network look, and log
+    keep: bool = True  # serve the page after the last frame too, until Ctrl-C or SIGTERM (of trihedron run; a sweep does not)
 
 
 VIEWS = {"foxglove": FoxgloveView, "rerun": RerunView}

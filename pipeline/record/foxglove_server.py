@@ -6,32 +6,63 @@ import threading
 from typing import Any
 
 import foxglove
+from foxglove.websocket import ChannelView, Client, ServerListener
 
 from trihedron.pipeline.core.errors import ConfigError
 
-HOST = "127.0.0.1"  # nobody but this machine
 SHOWN = ("/view/", "/tf", "/error", "/timing")  # beginnings of the channels that are sent
+IN_PARTS = ("/view/path",)  # channels whose messages add to each other; of any other, the last one says all
 BACKLOG = 256  # messages that wait for a client
 CLOSING_S = 2.0  # that closing waits for clients to be disconnected
+LOOPBACK = "127.0.0.1"
 
 
-class FoxgloveServer:
-    """A server on this machine. What is logged to channels of its context is sent to each client that has subscribed."""
+class FoxgloveServer(ServerListener):
+    """A server. What is logged to channels of its context is sent to each client that has subscribed. After the run's end a client that subscribes
+    gets what was last shown."""
 
-    def __init__(self, port: int) -> None:
-        """Open the port, 0 for any that is free. Raises ConfigError where it is in use."""
-        self.context = foxglove.Context()
+    def __init__(self, port: int, host: str = LOOPBACK) -> None:
+        """Listen on the address `host` and a port, 0 for any that is free. Raises ConfigError where that cannot be."""
+        self.context, self._host = foxglove.Context(), host
+        self._last: dict[int, list[tuple[foxglove.Channel, bytes]]] = {}  # number of a channel -> what was last shown there
+        self._last_ns = 0
+        self._ended = False
         try:
             self._server = foxglove.start_server(
-                name="trihedron", host=HOST, port=port, context=self.context, channel_filter=_is_shown, message_backlog_size=BACKLOG
+                name="trihedron",
+                host=host,
+                port=port,
+                context=self.context,
+                channel_filter=_is_shown,
+                message_backlog_size=BACKLOG,
+                server_listener=self,
             )
         except (RuntimeError, OSError, OverflowError) as error:
-            raise ConfigError("view.port", f"{port} cannot be opened: {error}", "give another view.port, 0 for any that is free") from error
+            cure = "give another view.port, 0 for any that is free"
+            raise ConfigError("view.port", f"{port} cannot be opened: {error}", cure if host == LOOPBACK else f"{cure}, or view.host") from error
 
     @property
     def url(self) -> str:
         """Return where a client connects."""
-        return f"ws://localhost:{self._server.port}"
+        return f"ws://{self._host}:{self._server.port}"
+
+    def remember(self, channel: foxglove.Channel, log_time: int, data: bytes) -> None:
+        """Hold what a channel was sent, for clients that come after the run."""
+        if _is_shown(channel):
+            parts = self._last.setdefault(channel.id(), [])
+            if channel.topic() not in IN_PARTS:
+                parts.clear()
+            parts.append((channel, data))
+            self._last_ns = log_time
+
+    def end_run(self) -> None:
+        """Send each client that subscribes from here on what was last shown. Call it when no file is written any more."""
+        self._ended = True
+
+    def on_subscribe(self, client: Client, channel: ChannelView) -> None:
+        """Send what was last shown, to every client of the channel: the library names no single one."""
+        for own, data in self._last.get(channel.id, ()) if self._ended else ():
+            own.log(data, log_time=self._last_ns)
 
     def close(self) -> None:
         """Disconnect all clients. One that connected and says nothing keeps the server from stopping: it is left to the end of the process."""
@@ -41,4 +72,5 @@ class FoxgloveServer:
 
 
 def _is_shown(channel: Any) -> bool:
-    return str(channel.topic).startswith(SHOWN)
+    topic = channel.topic
+    return str(topic() if callable(topic) else topic).startswith(SHOWN)

@@ -54,6 +54,7 @@ class McapWriter:
     def __init__(self, path: Path | None, server: FoxgloveServer | None = None, flush_s: float = FLUSH_SECONDS) -> None:
         """`flush_s` is the most that a kill may cost. Raises RecordingError when the file cannot be written or another process is writing it."""
         self.path, self._flush_s = path, flush_s
+        self._server = server
         self._context = server.context if server is not None else foxglove.Context()
         self._period_s = LIVE_SECONDS if server is not None else flush_s
         self._file = _File(path) if path is not None else None
@@ -122,8 +123,9 @@ class McapWriter:
         self._thread.join()
         if self._writer is not None:
             self._writer.close()
-        for channel in self._channels:
-            channel.close()
+        if self._server is None:  # else they stay until the server ends
+            for channel in self._channels:
+                channel.close()
         if self._file is not None:
             self._file.close()
         if self._mistake is not None:
@@ -164,8 +166,11 @@ class McapWriter:
         size, make = self._queue.popleft()
         if self._mistake is None and self.failure is None:
             try:
-                for channel, log_time, data in list(make()):
-                    self._channels[channel].log(data, log_time=log_time)
+                for number, log_time, data in list(make()):
+                    channel = self._channels[number]
+                    channel.log(data, log_time=log_time)
+                    if self._server is not None:
+                        self._server.remember(channel, log_time, data)
             except Exception as error:
                 self._mistake = error
         self._taken_bytes += size

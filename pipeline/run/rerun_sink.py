@@ -13,6 +13,7 @@ from trihedron.pipeline.record.rerun_view import at, begin, show_times, show_val
 from trihedron.pipeline.run.accounting import FrameTimes
 
 WAITING = 8  # frames that wait for the viewer; while it is slower, further ones are not shown
+CLOSING_S = 5.0  # that closing waits for the viewer, twice
 SPARSE_NS = 200_000_000  # between two values shown of the types that take long to show
 PERIODS_NS: dict[type[Value], int] = {
     Pose: 0,
@@ -52,11 +53,11 @@ class RerunSink:
         self._queue.put((value.index, value.stamp_ns, [value], {}))
 
     def close(self) -> None:
-        """Show what waits, and end."""
+        """Show what waits, and end; a viewer that does not go on is given up."""
         self._queue.put(None)
-        self._thread.join()
-        with suppress(RuntimeError):  # the viewer was closed
-            self._stream.flush()
+        self._thread.join(CLOSING_S)
+        with suppress(RuntimeError):  # the viewer was closed, or does not go on
+            self._stream.flush(timeout_sec=CLOSING_S)
 
     def _due(self, kind: type[Value], stamp_ns: int) -> bool:
         period, last = PERIODS_NS.get(kind), self._last_ns.get(kind)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import fcntl
 import os
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import yaml
@@ -52,3 +52,14 @@ def write_configuration(folder: Path, config: DictConfig, words: Sequence[str]) 
         write_file(folder / CONFIG / "overrides.yaml", yaml.safe_dump(list(words), allow_unicode=True))
     except OSError as error:
         raise ConfigError("out", f"the folder cannot be written: {error.strerror}: {error.filename}", CURE) from error
+
+
+def point_latest(out: Path) -> None:
+    """Point `runs/latest` beside dated run folders at the newest."""
+    runs = next((parent for parent in out.parents if parent.name == "runs"), None)
+    if runs is not None:
+        link = runs / "latest"
+        if link.is_symlink() or not link.exists():
+            link.unlink(missing_ok=True)
+            with suppress(FileExistsError):  # another job of a sweep was quicker
+                link.symlink_to(out.relative_to(runs), target_is_directory=True)

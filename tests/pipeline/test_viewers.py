@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import json
 import re
+import signal
 import socket
 import struct
 import subprocess
 import sys
 import threading
 import time
+import urllib.request
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +26,7 @@ from trihedron.datasets.simulation.synthetic import Synthetic
 from trihedron.pipeline.app.cli import main
 from trihedron.pipeline.core.types import Map, Surface
 from trihedron.pipeline.record.foxglove_server import FoxgloveServer
+from trihedron.pipeline.record.rerun_viewer import RerunViewer
 from trihedron.pipeline.record.writer import RecordingWriter
 from trihedron.pipeline.run.rerun_sink import WAITING, RerunSink
 from trihedron.pipeline.run.runner import Runner
@@ -103,7 +107,10 @@ def test_a_websocket_client_sees_the_run(tmp_path: Path) -> None:
 
 def test_viewers_change_no_byte(tmp_path: Path) -> None:
     words = ["dataset.width=160", "dataset.height=120", f"dataset.length={LENGTH}"]
-    runs = [th.run(*words, out=tmp_path / "plain", quiet=True), th.run(*words, "view=foxglove", "view.port=0", out=tmp_path / "seen", quiet=True)]
+    runs = [
+        th.run(*words, out=tmp_path / "plain", quiet=True),
+        th.run(*words, "view=foxglove", "view.port=0", out=tmp_path / "seen", quiet=True),
+    ]
     plain, seen = (run.recording._file for run in runs)
     for topic in plain.topics:
         assert list(plain.messages(f"/{topic}")) == list(seen.messages(f"/{topic}")), topic
@@ -160,7 +167,7 @@ class SlowStream:
     def set_time(self, *time: Any, **options: Any) -> None:
         self.go.wait()
 
-    def flush(self) -> None:
+    def flush(self, timeout_sec: float) -> None:
         """Nothing waits."""
 
 
@@ -185,8 +192,8 @@ def test_rerun_has_everything(tmp_path: Path) -> None:
     import trihedron.pipeline.app.viewers as viewers
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(viewers, "_rerun_stream", lambda options: stream)
-        assert main([*program, "view=rerun", f"out={tmp_path / 'run'}"]) == 0
+        patch.setattr(viewers, "opened_rerun", lambda host, port, web_port: nullcontext(RerunViewer(stream)))
+        assert main([*program, "view=rerun", "view.keep=false", f"out={tmp_path / 'run'}"]) == 0
     sink.close()
     stream.disconnect()
     done = subprocess.run([sys.executable, "-m", "rerun", "rrd", "print", str(tmp_path / "a.rrd")], capture_output=True, text=True)
@@ -218,3 +225,105 @@ def test_a_client_that_says_nothing_does_not_hold_the_run() -> None:
         "silent = socket.create_connection(('127.0.0.1', int(server.url.rpartition(':')[2]))); server.close(); print('closed')"
     )
     assert subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60).stdout == "closed\n"
+
+
+TINY = ["dataset.width=160", "dataset.height=120", "dataset.length=6"]
+
+
+class Kept:
+    """A command that goes on serving. `line` is the one that says so; what it printed before is in `printed`."""
+
+    def __init__(self, *words: str) -> None:
+        command = [sys.executable, "-c", "import sys; from trihedron.pipeline.app.cli import main; sys.exit(main())", *words]
+        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        self.printed: list[str] = []
+        assert self.process.stdout is not None
+        while "is served until" not in (line := self.process.stdout.readline()):
+            assert line, self.process.communicate()[1]
+            self.printed.append(line)
+        self.line = line
+
+    def end(self, number: int) -> int:
+        """Send the signal; return the exit code."""
+        self.process.send_signal(number)
+        self.process.communicate(timeout=60)
+        return self.process.returncode
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_foxglove_server_stays_with_what_was_last_shown(number: int, tmp_path: Path) -> None:
+    port = free_port()
+    kept = Kept("run", *TINY, "view=foxglove", f"view.port={port}", f"out={tmp_path}")
+    try:
+        assert kept.line == f"view: ws://127.0.0.1:{port} is served until Ctrl-C or SIGTERM; view.keep=false ends it with the run\n"
+        assert f"  {tmp_path / 'metrics.json'}\n" in kept.printed and len(th.Recording(tmp_path).poses) == 6
+        shown = {"/tf", "/view/image", "/view/path", "/view/map_points"}
+        late = Client(port, shown)
+        for _ in range(300):
+            if {topic for topic, _, _ in late.messages} == shown:
+                break
+            time.sleep(0.1)
+        assert {topic for topic, _, _ in late.messages} == shown
+        assert kept.end(number) == 0
+        late.closed()
+    finally:
+        kept.process.kill()
+
+
+def test_a_server_that_is_not_kept_ends_with_the_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["run", *TINY, "view=foxglove", "view.port=0", "view.keep=false", "view.host=127.0.0.1", f"out={tmp_path}"]) == 0
+    assert "is served until" not in capsys.readouterr().out
+
+
+def test_no_window_without_a_display(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(sys, "platform", "linux")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    assert main(["run", "view=rerun", f"out={tmp_path / 'none'}"]) == 1
+    line = "trihedron: view: there is no display (DISPLAY and WAYLAND_DISPLAY are not set); give view.web=true for a browser\n"
+    assert capsys.readouterr().err == line and not (tmp_path / "none").exists()
+
+
+def page(url: str) -> bytes:
+    with urllib.request.urlopen(url, timeout=10) as answer:
+        content: bytes = answer.read()
+    return content
+
+
+def other_address() -> str:
+    """An address of this machine that is not the loopback's, or nothing."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(("192.0.2.1", 9))  # sends nothing
+        except OSError:
+            return ""
+        return str(probe.getsockname()[0])
+
+
+@pytest.mark.slow
+def test_rerun_is_served_to_this_machine_until_the_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("rerun")
+    port, web_port = free_port(), free_port()
+    url = f"http://127.0.0.1:{web_port}?url=rerun%2Bhttp%3A%2F%2F127.0.0.1%3A{port}%2Fproxy"
+    ports = f"view.port={port}", f"view.web_port={web_port}"
+    kept = Kept("run", *TINY, "view=rerun", "view.web=true", *ports, f"out={tmp_path / 'run'}")
+    try:
+        assert kept.printed[0] == f"view: open {url} in a browser\n" and url in kept.line
+        assert b"rerun" in page(url).lower()
+        for number in (port, web_port) if other_address() else ():
+            with pytest.raises(OSError):
+                socket.create_connection((other_address(), number), timeout=5).close()
+        assert main(["run", "view=rerun", "view.web=true", *ports, f"out={tmp_path / 'none'}"]) == 1
+        assert capsys.readouterr().err == f"trihedron: view.port: {port} is in use; give another view.port\n"
+        assert kept.end(signal.SIGTERM) == 0
+    finally:
+        kept.process.kill()
+    with pytest.raises(OSError):
+        page(url)
+    kept = Kept("view", str(tmp_path / "run"), "--web", "--port", str(port), "--web-port", str(web_port))
+    try:
+        assert kept.printed == [f"6 frames of {tmp_path / 'run' / 'run.mcap'}\n"]
+        assert kept.line == f"view: {url} is served until Ctrl-C or SIGTERM\n"
+        assert b"rerun" in page(url).lower() and kept.end(signal.SIGINT) == 0
+    finally:
+        kept.process.kill()

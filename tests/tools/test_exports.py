@@ -3,6 +3,7 @@
 import csv
 import subprocess
 import sys
+from contextlib import nullcontext
 
 import cv2
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 from trihedron.pipeline.app.cli import main
 from trihedron.pipeline.app.recorded_values import last_map
 from trihedron.pipeline.core.geometry import invert
-from trihedron.pipeline.record import rerun_view
+from trihedron.pipeline.record import rerun_view, rerun_viewer
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import read_trajectory
 from trihedron.tools import export_rerun
@@ -91,27 +92,29 @@ def test_what_cannot_be_exported_is_one_line(run, tmp_path, monkeypatch, capsys)
     assert capsys.readouterr().err == "trihedron: pycolmap: is not installed; install it with: pip install pycolmap\n"
 
 
-class Windowless:
-    """rerun where there is no display: the stream takes everything, and cannot hand it over."""
+class ClosedWindow:
+    """A stream to a window that was closed: it takes everything, and cannot hand it over."""
 
-    class RecordingStream:
-        def __init__(self, name):
-            pass
-
-        def spawn(self):
-            pass
-
-        def flush(self):
-            raise RuntimeError("gRPC has been unable to connect for 7s")
+    def flush(self):
+        raise RuntimeError("gRPC has been unable to connect for 7s")
 
 
-def test_a_viewer_that_does_not_open_is_one_line(run, monkeypatch, capsys):
-    monkeypatch.setattr(rerun_view, "require_rerun", lambda: Windowless)
+def test_a_window_that_closes_is_one_line(run, monkeypatch, capsys):
+    monkeypatch.setattr(rerun_view, "require_rerun", lambda: None)
+    monkeypatch.setattr(rerun_viewer, "lacks_display", lambda: False)
+    monkeypatch.setattr(rerun_viewer, "opened_rerun", lambda host, port, web_port: nullcontext(rerun_viewer.RerunViewer(ClosedWindow())))
     monkeypatch.setattr(export_rerun, "show", lambda recording, stream: 9)
     assert main(["view", str(run)]) == 2
-    printed = capsys.readouterr()
-    line = f"its window does not open: gRPC has been unable to connect for 7s; write a file instead: trihedron export {run} --to rerun"
-    assert printed.err == f"trihedron: rerun: {line}\n" and printed.out == ""
+    line = f"does not take the run: gRPC has been unable to connect for 7s; write a file instead: trihedron export {run} --to rerun"
+    assert capsys.readouterr().err == f"trihedron: rerun: {line}\n"
+
+
+def test_without_a_display_view_names_the_browser(run, monkeypatch, capsys):
+    monkeypatch.setattr(rerun_view, "require_rerun", lambda: None)
+    monkeypatch.setattr(rerun_viewer, "lacks_display", lambda: True)
+    assert main(["view", str(run)]) == 2
+    line = f"trihedron: view: there is no display for rerun's window; serve it to a browser: trihedron view {run} --web\n"
+    assert capsys.readouterr() == ("", line)
 
 
 @pytest.mark.slow
