@@ -2,8 +2,9 @@
 
 It is started by `trihedron.tools.peers` in a process of its own and needs that package and NumPy alone, nothing of this project.
 `--find` prints as JSON whether the package loads and where its vocabulary is. With the file of a job it tracks the job's frames at the camera's rate,
-and writes `poses.npy` ((n, 4, 4) T_world_camera, metres, NaN where there is none), `final.txt` (TUM format, as corrected at the end) and
-`result.json`. There `frame_ms` is `track_rgbd` alone, with the arrays in memory, and `arrival_ms` from when a frame is due to its pose, with reading.
+and writes `poses.npy` ((n, 4, 4) T_world_camera, metres, NaN where it is lost), `final.txt` (TUM format, as corrected at the end) and
+`result.json`; `progress` has a byte for each frame that is done. In the result, `frame_ms` is `track_rgbd` alone, with the arrays in memory, and
+`arrival_ms` from when a frame is due to its pose, with reading its file.
 """
 
 from __future__ import annotations
@@ -48,6 +49,7 @@ def track(job: dict[str, Any]) -> None:
     import pyorbslam3
 
     out = Path(job["out"])
+    progress = (out / "progress").open("wb", buffering=0)
     before = time.perf_counter()
     slam = pyorbslam3.Slam(job["vocabulary"], job["settings"], sensor=pyorbslam3.Sensor.RGBD)
     load_s = time.perf_counter() - before
@@ -66,18 +68,29 @@ def track(job: dict[str, Any]) -> None:
         ended = time.perf_counter()
         frame_ms.append(1e3 * (ended - began))
         arrival_ms.append(1e3 * (ended - due))
-        if found.pose_valid:
+        if found.ok:  # `pose_valid` is true of the last pose, too, in the seconds after it is lost
             poses[number] = found.pose_wc
             first_pose_s = ended - BEGAN if first_pose_s is None else first_pose_s
         threads = max(threads, int(_status("Threads")))
+        progress.write(b".")
+    progress.close()
     cpu_s = time.process_time() - cpu_s - reading_s
     np.save(out / "poses.npy", poses)
     figures = {"frame_ms": frame_ms, "arrival_ms": arrival_ms, "cpu_s": cpu_s, "threads": threads, "load_s": load_s, "first_pose_s": first_pose_s}
     figures["peak_memory_mb"] = 1.024e-3 * int(_status("VmHWM"))
     slam.shutdown()
     if first_pose_s is not None:
-        slam.save_trajectory_tum(str(out / "final.txt"))
+        slam.save_trajectory_tum(str(out / "saved.txt"))
+        _write_once(out / "saved.txt", out / "final.txt")
     (out / "result.json").write_text(json.dumps(figures))
+
+
+def _write_once(saved: Path, final: Path) -> None:
+    """Copy a trajectory without the repeats of the last pose, stamp and all, which ORB-SLAM3 saves for each frame in which it is lost."""
+    lines: dict[str, str] = {}
+    for line in saved.read_text().splitlines(keepends=True):
+        lines.setdefault(line.partition(" ")[0], line)
+    final.write_text("".join(lines.values()))
 
 
 def _status(name: str) -> str:

@@ -144,10 +144,10 @@ def peer_figures(peer: Peer, job: Job, run: Path) -> dict[str, Any]:
         with log.open("w") as file:
             done = subprocess.run([peer.python, str(PROGRAM), str(job.file)], stdout=file, stderr=subprocess.STDOUT, timeout=limit_s)
         if done.returncode:
-            return {"failed": _ending(done.returncode, log)}
+            return {"failed": f"{_ending(done.returncode, log)}, {_progress(job)}"}
         figures, poses = _results(job)
     except subprocess.TimeoutExpired:
-        return {"failed": f"did not end within {limit_s:.0f} s"}
+        return {"failed": f"did not end within {limit_s:.0f} s, {_progress(job)}"}
     except (OSError, ValueError, KeyError, TypeError, EOFError) as error:
         return {"failed": printable(f"left no results that can be read ({error})", 200)}
     tracked = np.isfinite(poses).all(axis=(1, 2))
@@ -160,12 +160,18 @@ def peer_figures(peer: Peer, job: Job, run: Path) -> dict[str, Any]:
     return figures
 
 
+def _progress(job: Job) -> str:
+    """Return how far the program came."""
+    file = job.out / "progress"
+    return f"after {file.stat().st_size if file.exists() else 0} of {len(job.stamps_ns)} frames"
+
+
 def _ending(code: int, log: Path) -> str:
     """Return how a process ended that did not end well, with its last words."""
     if code < 0:
         return f"was ended by {signal.Signals(-code).name}"
     words = log.read_text(errors="replace").strip().splitlines()
-    return printable(f"ended with exit code {code}" + (f": {words[-1]}" if words else ""), 200)
+    return printable(f"ended with exit code {code}" + (f" ({words[-1]})" if words else ""), 200)
 
 
 def _results(job: Job) -> tuple[dict[str, Any], Any]:
