@@ -23,6 +23,7 @@ BESIDE = ("tests", "docs/site", "examples", ".ci")
 OF_EXTRAS_FOR_DEVELOPERS = {"docs", "dev"}
 NAMESPACES = {"hydra_plugins"}  # which several distributions share: the module below tells them apart
 UNDECLARED = {  # module -> why no dependency or extra declares it
+    "pyorbslam3": "tools/peers/orbslam3.py, a program that runs in another interpreter; GPL-3",
     "pandas": "trihedron.compare returns a DataFrame where it is installed",
     "geometry_msgs": "ROS 2, from the Debian packages of a distribution of ROS",
     "message_filters": "ROS 2",

@@ -1,9 +1,12 @@
 """Time a run per frame and stage, with its memory, beside a fixed reference workload of the same minute and frames.
 
 The machine's speed varies, so times are also given as multiples of the reference: OpenCV ORB (1000 features, 8 levels) and LSD on the same frames,
-one thread, measured before and after each run. --paced runs the frames a second time at the camera's own rate: latency is then from asking for a
-frame's files to its pose, and the time it waits behind others does not count. --cold runs one frame with an empty kernel cache. --compare lists what
-became slower since a --json file.
+one thread, measured before and after each run. --paced runs the frames a second time at the camera's own rate: latency is then from when a
+frame is due, before its files are read, to its pose. --cold runs one frame with an empty kernel cache. --compare lists what became slower since a
+--json file.
+
+--peers runs ORB-SLAM3 on the same frames at the camera's rate, too, in an interpreter that has the package pyorbslam3 (GPL-3, no dependency of this
+project), and prints both side by side. Its trajectories are judged by the same ground truth and code.
 
 Other comparisons, each with its --help: `trihedron benchmark methods` (every plugin in the default graph) and `trihedron benchmark rotations`
 (estimators of the Manhattan frame over one recording). The source checkout has more, which an installed package has not: `trihedron benchmark
@@ -17,6 +20,7 @@ benchmark honesty` (both in one table, with recorded sequences).
 `trihedron compare` makes a table of the runs of any sweep.
 
 Example: trihedron benchmark FOLDER dataset.frames=0:150 --json benchmark.json
+Example: trihedron benchmark FOLDER --peers --peer-python orbslam3/bin/python --vocabulary ORBvoc.txt
 """
 
 from __future__ import annotations
@@ -41,6 +45,7 @@ from trihedron.pipeline.core.layouts import data_set_words
 from trihedron.pipeline.core.types import U8
 from trihedron.tools.arguments import Parser
 from trihedron.tools.benchmark_comparison import comparison_table, read_figures, times
+from trihedron.tools.peers.side_by_side import find_peer, own_figures, peer_figures, side_by_side, write_job
 
 PROGRAM = (sys.executable, "-c", "import sys; from trihedron.pipeline.app.cli import main; sys.exit(main(sys.argv[1:]))")
 REFERENCE_FRAMES = 40  # at most
@@ -74,18 +79,30 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--compare", type=Path, metavar="OLD.json", help="say what became slower since then")
     parser.add_argument("--paced", action="store_true", help="a second run at the camera's own rate")
     parser.add_argument("--cold", action="store_true", help="time the first frame with an empty kernel cache, too (half a minute)")
+    parser.add_argument("--peers", action="store_true", help="--paced, and ORB-SLAM3 on the same frames")
+    parser.add_argument("--peer-python", metavar="PYTHON", help="with --peers: an interpreter that has pyorbslam3 (default: this one)")
+    parser.add_argument("--vocabulary", type=Path, metavar="FILE", help="with --peers: ORBvoc.txt (default: that in the cache of pyorbslam3)")
     options, rest = parser.parse_known_args(argv)
     overrides = [override for word in (*options.overrides, *rest) for override in data_set_words(word)]
     _check_overrides(overrides)
     old = read_figures(options.compare) if options.compare else None
+    peer = find_peer(options.peer_python or sys.executable, options.vocabulary) if options.peers else None
+    if peer is None and (options.peer_python or options.vocabulary):
+        raise UsageError("benchmark", f"{'--peer-python' if options.peer_python else '--vocabulary'} is of --peers", "give --peers too")
     with tempfile.TemporaryDirectory() as folder:
         images = sample_images(overrides)
+        job = write_job(dataset_of(overrides), peer, Path(folder) / "peer") if peer is not None else None
         reference = [reference_ms(images)]
         figures = measure([*overrides, f"out={folder}/run"], Path(folder) / "run")
         reference.append(reference_ms(images))
         figures["cli_cpu_s"] = _cpu_of(["--help"])
-        if options.paced:
-            figures["paced"] = measure([*overrides, "real_time=true", f"out={folder}/paced"], Path(folder) / "paced")["frame_ms"]
+        if options.paced or options.peers:
+            paced = measure([*overrides, "real_time=true", f"out={folder}/paced"], Path(folder) / "paced")
+            figures["paced"] = paced["frame_ms"]
+            reference.append(reference_ms(images))
+        if peer is not None and job is not None:
+            run = Path(folder) / "paced"
+            figures["peers"] = {"trihedron": own_figures(figures, paced, run), "orbslam3": peer_figures(peer, job, run)}
             reference.append(reference_ms(images))
         figures["reference_ms"], figures["reference_each_ms"] = round(statistics.mean(reference), 2), reference
         if options.cold:
@@ -132,6 +149,7 @@ def measure(overrides: list[str], out: Path, environment: dict[str, str] | None 
         last = errors.strip().splitlines()[-1].removeprefix("trihedron: ") if errors.strip() else "without a word"
         raise StageError("benchmark", f"the run failed: {last}", "mend that first")
     figures: dict[str, Any] = json.loads((out / "timing.json").read_text())
+    figures["tracking_cpu_s"] = figures["cpu_s"]
     figures["cpu_s"] = round(usage.ru_utime + usage.ru_stime, 2)
     figures["process_s"] = round(time.perf_counter() - began, 2)
     if (out / "metrics.json").exists():
@@ -171,11 +189,16 @@ def machine() -> dict[str, Any]:
     }  # fmt: skip
 
 
-def sample_images(overrides: list[str]) -> list[U8]:
-    """Grey images (h, w) of frames spread over the run."""
+def dataset_of(overrides: list[str]) -> Any:
+    """Return the data set of a run."""
     from trihedron.pipeline.core.config import compose_run, make_plugin
 
-    dataset = make_plugin("dataset", compose_run(overrides).dataset)
+    return make_plugin("dataset", compose_run(overrides).dataset)
+
+
+def sample_images(overrides: list[str]) -> list[U8]:
+    """Grey images (h, w) of frames spread over the run."""
+    dataset = dataset_of(overrides)
     frames = [dataset(i) for i in range(0, len(dataset), max(-(-len(dataset) // REFERENCE_FRAMES), 1))]
     return [frame.gray for frame in frames if frame is not None]
 
@@ -218,4 +241,6 @@ def report(figures: dict[str, Any]) -> str:
     final = figures.get("metrics", {}).get("final")
     if final:
         lines.append(f"ATE {final['ate_rmse_m']:.4f} m")
+    if "peers" in figures:
+        lines += ["", side_by_side(figures["peers"]["trihedron"], figures["peers"]["orbslam3"], reference)]
     return "\n".join(lines)
