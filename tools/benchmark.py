@@ -2,8 +2,8 @@
 
 The machine's speed varies, so times are also given as multiples of the reference: OpenCV ORB (1000 features, 8 levels) and LSD on the same frames,
 one thread, measured before and after each run. --paced runs the frames a second time at the camera's own rate: latency is then from when a
-frame is due, before its files are read, to its pose. --cold runs one frame with an empty kernel cache. --compare lists what became slower since a
---json file.
+frame is due, before its files are read, to its pose. --one-core plays the frames as a camera would on one core and one thread, which drops those that
+come while it is busy. --cold runs one frame with an empty kernel cache. --compare lists what became slower since a --json file.
 
 --peers runs ORB-SLAM3 on the same frames at the camera's rate, too, in an interpreter that has the package pyorbslam3 (GPL-3, no dependency of this
 project), and prints both side by side. Its trajectories are judged by the same ground truth and code.
@@ -48,6 +48,7 @@ from trihedron.tools.benchmark_comparison import comparison_table, read_figures,
 from trihedron.tools.peers.side_by_side import find_peer, own_figures, peer_figures, side_by_side, write_job
 
 PROGRAM = (sys.executable, "-c", "import sys; from trihedron.pipeline.app.cli import main; sys.exit(main(sys.argv[1:]))")
+ON_ONE_CORE = (*PROGRAM[:2], "import os; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))}); " + PROGRAM[2])  # Linux
 REFERENCE_FRAMES = 40  # at most
 OF_CHECKOUT = "trihedron.tools.benchmarks"  # which wheels lack
 COMPARISONS = {  # other words after `benchmark`, and whose `main` they stand for
@@ -78,6 +79,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures too")
     parser.add_argument("--compare", type=Path, metavar="OLD.json", help="say what became slower since then")
     parser.add_argument("--paced", action="store_true", help="a second run at the camera's own rate")
+    parser.add_argument("--one-core", action="store_true", help="a run at the camera's own rate on one core, which may drop frames")
     parser.add_argument("--cold", action="store_true", help="time the first frame with an empty kernel cache, too (half a minute)")
     parser.add_argument("--peers", action="store_true", help="--paced, and ORB-SLAM3 on the same frames")
     parser.add_argument("--peer-python", metavar="PYTHON", help="with --peers: an interpreter that has pyorbslam3 (default: this one)")
@@ -99,6 +101,10 @@ def main(argv: list[str]) -> int:
         if options.paced or options.peers:
             paced = measure([*overrides, "real_time=true", f"out={folder}/paced"], Path(folder) / "paced")
             figures["paced"] = paced["frame_ms"]
+            reference.append(reference_ms(images))
+        if options.one_core:
+            words = [*overrides, "live=true", "threads=1", f"out={folder}/one_core"]
+            figures["one_core"] = measure(words, Path(folder) / "one_core", program=ON_ONE_CORE)
             reference.append(reference_ms(images))
         if peer is not None and job is not None:
             run = Path(folder) / "paced"
@@ -134,14 +140,14 @@ def _check_overrides(overrides: list[str]) -> None:
             raise UsageError("benchmark", f"'{word}' is neither key=value, a comparison nor an existing folder", did_you_mean(word, COMPARISONS))
 
 
-def measure(overrides: list[str], out: Path, environment: dict[str, str] | None = None) -> dict[str, Any]:
+def measure(overrides: list[str], out: Path, environment: dict[str, str] | None = None, program: Sequence[str] = PROGRAM) -> dict[str, Any]:
     """`timing.json` and metrics of one run in its own process. Raises TrihedronError when it fails.
 
     The peak of its memory is the one it has measured itself: what the system counts of a child begins with what its parent held."""
     from trihedron.pipeline.core.errors import StageError
 
     began = time.perf_counter()
-    process = subprocess.Popen([*PROGRAM, "run", *overrides], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, env=environment)
+    process = subprocess.Popen([*program, "run", *overrides], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, env=environment)
     assert process.stderr is not None
     errors = process.stderr.read()
     _, status, usage = os.wait4(process.pid, 0)
@@ -238,9 +244,26 @@ def report(figures: dict[str, Any]) -> str:
         f"CPU {figures['cpu_s']:.1f} s ({used:.2f} cores), start-up included: {1e3 * figures['cpu_s'] / max(figures['frames'], 1):.1f} ms a frame;"
         f" peak memory {memory_text(figures)} MB",
     ]
-    final = figures.get("metrics", {}).get("final")
-    if final:
-        lines.append(f"ATE {final['ate_rmse_m']:.4f} m")
+    lines += [ate_text(figures)] if ate_text(figures) else []
+    if "one_core" in figures:
+        lines.append(_one_core_text(figures["one_core"], reference))
     if "peers" in figures:
         lines += ["", side_by_side(figures["peers"]["trihedron"], figures["peers"]["orbslam3"], reference)]
     return "\n".join(lines)
+
+
+def ate_text(figures: dict[str, Any]) -> str:
+    """The ATE of a run; empty without ground truth."""
+    final = figures.get("metrics", {}).get("final")
+    return f"ATE {final['ate_rmse_m']:.4f} m" if final else ""
+
+
+def _one_core_text(figures: dict[str, Any], reference: float) -> str:
+    live, latency = figures["live"], figures["frame_ms"]
+    words = [
+        f"on one core at the camera's rate: {live['taken']} of {live['came']} frames taken ({live['taken'] / max(live['came'], 1):.1%})",
+        f"p50 {latency['p50']:.1f} ms, p95 {latency['p95']:.1f} ms ({latency['p95'] / reference:.2f} x reference)",
+        f"{1e3 * figures['tracking_cpu_s'] / max(figures['frames'], 1):.1f} ms of CPU a frame",
+        ate_text(figures),
+    ]
+    return ", ".join(word for word in words if word)

@@ -2,6 +2,7 @@
 
 import copy
 import json
+import re
 
 import cv2
 import numpy as np
@@ -77,9 +78,12 @@ def test_every_layout_of_a_folder_is_measured(tmp_path, capsys):
         cv2.imwrite(str(tmp_path / "rgb" / f"{k}.png"), rng.integers(0, 256, (48, 64, 3), dtype=np.uint8))
         cv2.imwrite(str(tmp_path / "depth" / f"{k}.png"), np.full((48, 64), 2000, np.uint16))
     (tmp_path / "camera.yaml").write_text("{width: 64, height: 48, fx: 60, fy: 60, cx: 31.5, cy: 23.5, depth_scale: 1000}\n")
-    assert main(["benchmark", str(tmp_path), "outputs=[normals]", "record.topics=[]"]) == 0
+    assert main(["benchmark", str(tmp_path), "outputs=[normals]", "record.topics=[]", "--one-core"]) == 0
     printed = capsys.readouterr().out
     assert printed.splitlines()[1].startswith("3 frames, ") and "start-up included: " in printed and " ms a frame; peak memory " in printed
+    assert re.search(
+        r"^on one core at the camera's rate: \d of \d frames taken \(\d+.\d%\), p50 .* x reference\), .* ms of CPU a frame$", printed, re.M
+    )
 
 
 def test_another_file_is_no_benchmark(capsys, tmp_path):
