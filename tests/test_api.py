@@ -10,6 +10,7 @@ import pytest
 
 import trihedron as th
 from trihedron.datasets.simulation.synthetic import Synthetic
+from trihedron.pipeline.core import types
 from trihedron.pipeline.record import reader
 
 LENGTH = 24
@@ -310,3 +311,33 @@ def test_runs_are_compared_as_a_table(tmp_path):
     assert [row["change"] for row in (table if isinstance(table, list) else table.to_dict("records"))] == ["threads=1", "threads=2"]
     with pytest.raises(th.TrihedronError, match="-m: is a sweep"):
         th.run("-m", "threads=1,2")
+
+
+@pytest.mark.parametrize(
+    ("numbers", "message"),
+    [
+        ((0, 480, 500.0, 500.0, 319.5, 239.5), "width is not within 1 … 32768"),
+        ((640, -480, 500.0, 500.0, 319.5, 239.5), "height is not within 1 … 32768"),
+        ((640, 480, -500.0, 500.0, 319.5, 239.5), "fx is not within 0.001 … 1e+06"),
+        ((640, 480, 500.0, 500.0, 2e6, 239.5), "cx is not within -1e+06 … 1e+06"),
+        ((640, 480, 500.0, 500.0, 319.5, float("nan")), "cy is not within -1e+06 … 1e+06"),
+        ((640, 480, 500.0, 500.0, 319.5, 239.5, 1e7), "fps is not within 1e-06 … 1e+06"),
+        ((640, 480, "500", 500.0, 319.5, 239.5), "fx is str, not a number"),
+        ((640.5, 480, 500.0, 500.0, 319.5, 239.5), "width is float, not a whole number"),
+    ],
+)
+def test_a_camera_that_is_none_is_refused_where_it_is_made(numbers, message):
+    """With the bounds of a recording: a run with such a camera could not be replayed."""
+    for make in (th.Camera, lambda *given: th.Camera.of(types.Camera(*given))):
+        with pytest.raises(th.TrihedronError) as error:
+            make(*numbers)
+        assert str(error.value) == f"camera: {message}; give the numbers of a calibration, in pixels"
+
+
+def test_what_is_no_camera_is_refused():
+    with pytest.raises(th.TrihedronError) as error:
+        th.Camera.of(3)
+    cure = 'give trihedron.Camera.from_yaml("camera.yaml"), or trihedron.Camera(width, height, fx, fy, cx, cy)'
+    assert str(error.value) == f"camera: is int, not a camera; {cure}"
+    with pytest.raises(th.TrihedronError, match="distortion holds coefficients that are not within ±100"):
+        th.Camera(640, 480, 500.0, 500.0, 319.5, 239.5, distortion=(0.0, 1e10, 0.0, 0.0, 0.0))

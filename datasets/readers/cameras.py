@@ -14,11 +14,13 @@ from trihedron.datasets.readers.registration import DepthCamera, Rectification
 from trihedron.pipeline.core.errors import DataError, did_you_mean, printable
 from trihedron.pipeline.core.files import MAX_YAML_BYTES, SHOWN, YamlError, parse_yaml, read_text
 from trihedron.pipeline.core.types import EXACT_DEPTH, Camera, DepthNoise
+from trihedron.pipeline.core.value_checks import camera_fault
 
 CAMERA_FILE = "camera.yaml"
 REQUIRED = ("width", "height", "fx", "fy", "cx", "cy", "depth_scale")
 OPTIONAL = ("distortion", "fps", "depth_noise", "depth_offset", "depth_radial", "depth_camera")
-BOUNDED, SMALLEST, LARGEST = ("fx", "fy", "depth_scale", "fps"), 1e-6, 1e9  # outside, single precision overflows
+SMALLEST_SCALE, LARGEST_SCALE = 1e-6, 1e9  # outside, single precision overflows
+LARGEST_COEFFICIENT = 100.0  # of a distortion; those of lenses are below 10
 LARGEST_RADIAL = 0.5
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")
 NOISES = {"kinect": DepthNoise(), "exact": EXACT_DEPTH}
@@ -117,8 +119,8 @@ def _calibration(path: Path, content: dict[str, Any]) -> Calibration:
             raise DataError(
                 str(path), f"{key} is {_printable_value(content[key])}", f"give a positive {'whole ' if key in ('width', 'height') else ''}number"
             )
-    if values["width"] * values["height"] > MAX_PIXELS or not all(SMALLEST < values.get(key, 1.0) < LARGEST for key in BOUNDED):
-        raise DataError(str(path), "describes no camera", f"give an image of at most {MAX_PIXELS} pixels; {', '.join(BOUNDED)} above {SMALLEST:g}")
+    if values["width"] * values["height"] > MAX_PIXELS:
+        raise DataError(str(path), "describes no camera", f"give an image of at most {MAX_PIXELS} pixels")
     noise = content.get("depth_noise", "kinect")
     if not isinstance(noise, str) or noise not in NOISES:
         raise DataError(str(path), f"depth_noise is '{_printable_value(noise)}'", did_you_mean(_printable_value(noise), NOISES))
@@ -130,7 +132,23 @@ def _calibration(path: Path, content: dict[str, Any]) -> Calibration:
             str(path), f"depth_radial is {_printable_value(content['depth_radial'])}", f"give a relative error within ±{LARGEST_RADIAL:g}"
         )
     distortion, depth_camera = _distortion(path, content.get("distortion")), _depth_camera(path, content.get("depth_camera"))
-    return Calibration(camera, values["depth_scale"], distortion, offset, radial, depth_camera)
+    calibration = Calibration(camera, values["depth_scale"], distortion, offset, radial, depth_camera)
+    if fault := calibration_fault(calibration):
+        raise DataError(str(path), fault, "give the numbers of a calibration, in pixels")
+    return calibration
+
+
+def calibration_fault(found: Calibration) -> str:
+    """Return the first number of a calibration that no camera has, with the cause; empty for none."""
+    if fault := camera_fault(found.camera):
+        return fault
+    if found.depth_scale and not SMALLEST_SCALE <= found.depth_scale <= LARGEST_SCALE:
+        return f"depth_scale is not within {SMALLEST_SCALE:g} … {LARGEST_SCALE:g}"
+    if not all(abs(coefficient) <= LARGEST_COEFFICIENT for coefficient in found.distortion):
+        return f"distortion holds coefficients that are not within ±{LARGEST_COEFFICIENT:g}"
+    if (depth := found.depth_camera) is not None:
+        fault = camera_fault(replace(found.camera, fx=depth.fx, fy=depth.fy, cx=depth.cx, cy=depth.cy))
+    return f"depth_camera.{fault}" if fault else ""
 
 
 def _depth_camera(path: Path, given: Any) -> DepthCamera | None:
@@ -147,8 +165,6 @@ def _depth_camera(path: Path, given: Any) -> DepthCamera | None:
     if missing is not None:
         raise DataError(str(path), f"the key 'depth_camera.{missing}' is missing", f"give it {' '.join(known[:4])}")
     fx, fy, cx, cy = (_number(path, f"depth_camera.{key}", given[key]) for key in known[:4])
-    if not all(SMALLEST < value < LARGEST for value in (fx, fy)):
-        raise DataError(str(path), "depth_camera describes no camera", f"give fx and fy above {SMALLEST:g}")
     return DepthCamera(fx, fy, cx, cy, *(_three(path, f"depth_camera.{key}", given.get(key)) for key in known[4:]))
 
 

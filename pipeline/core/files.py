@@ -23,6 +23,7 @@ MAX_NETWORK_BYTES = 2**31  # of an ONNX file, as its format has it
 MAX_YAML_BYTES = 1_000_000
 MAX_YAML_DEPTH = 20  # of nested lists and mappings
 BASE_60, LONGEST_TIME = re.compile(r"[-+\d_.:]*:[-+\d_.:]*"), 100  # to read 1:1:1:… as YAML 1.1 has it takes time with the square of its length
+SURROGATE, SLOWLY_READ = re.compile(r"\\uDC[89A-F]", re.IGNORECASE), 100_000  # a byte of a path that is not UTF-8, as PyYAML writes it
 SHOWN = 60  # characters of a stranger's text in a message
 STREAMS = (Path("/dev"), Path("/dev/fd"), Path("/proc/self/fd"))  # folders of devices and open files, which nothing may replace
 
@@ -131,14 +132,15 @@ class YamlError(ValueError):
 def parse_yaml(text: str, max_depth: int = MAX_YAML_DEPTH) -> Any:
     """Return plain values of YAML without aliases. Raises YamlError, one line."""
     depth = 0
+    loader = yaml.SafeLoader if len(text) <= SLOWLY_READ and SURROGATE.search(text) else yaml.CSafeLoader  # libyaml refuses such names of files
     try:
-        for event in yaml.parse(text, yaml.CSafeLoader):
+        for event in yaml.parse(text, loader):
             depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
             if depth > max_depth or isinstance(event, yaml.AliasEvent):
                 raise YamlError("with aliases or deep nesting", event.start_mark.line + 1)
             if isinstance(event, yaml.ScalarEvent) and len(event.value) > LONGEST_TIME and BASE_60.fullmatch(event.value):
                 raise YamlError(f"with a number a:b:c of more than {LONGEST_TIME} characters", event.start_mark.line + 1)
-        return yaml.CSafeLoader(text).get_single_data()
+        return loader(text).get_single_data()
     except YamlError:
         raise
     except Exception as error:  # PyYAML raises ValueError, TypeError, OverflowError and others for scalars such as 2024-13-45

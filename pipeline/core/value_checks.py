@@ -7,6 +7,7 @@ would reach compiled kernels, which check nothing. What a plugin of this run com
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
+from numbers import Integral, Real
 from typing import Annotated, Any, NamedTuple, get_args, get_origin, get_type_hints
 
 import numpy as np
@@ -18,6 +19,10 @@ from trihedron.pipeline.core.slots import SLOTS, output_of
 from trihedron.pipeline.core.types import Camera, Frame, Value
 
 ORTHONORMAL = 1e-6  # of RᵀR - I, its largest element
+CAMERA_NUMBERS = (
+    *((name, Integral, "a whole number") for name in ("width", "height")),
+    *((name, Real, "a number") for name in ("fx", "fy", "cx", "cy", "fps")),
+)
 PREVIOUS = "previous"  # parameters that take an earlier value begin with it
 LARGEST = 1e100  # of a number; the square of one has to be finite
 UNIT = 1e-6  # of |n| - 1
@@ -59,6 +64,15 @@ def validate_value(topic: str, value: Value, place: str, expected: type[Value] =
     for name, cause in _faults(value, ""):
         raise RecordingError(f"{place}: topic /{topic}, frame {value.index}", f"the field '{name}' {cause}", CURE)
     return value
+
+
+def camera_fault(camera: Camera) -> str:
+    """Return the first number of a camera that is not what `Camera` declares, with the cause, as 'fx is not within 0.001 … 1e+06'; empty for none."""
+    for name, kind, described in CAMERA_NUMBERS:
+        value = getattr(camera, name)
+        if isinstance(value, bool) or not isinstance(value, kind):
+            return f"{name} is {type(value).__name__}, not {described}"
+    return next((f"{name} {cause}" for name, cause in _faults(camera, "")), "")
 
 
 def check_together(inputs: Mapping[str, Any], place: str, topics: Mapping[str, str], computed: Collection[str] = ()) -> None:

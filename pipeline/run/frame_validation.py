@@ -11,6 +11,7 @@ import numpy as np
 
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.types import F32, U8, Frame
+from trihedron.pipeline.core.value_checks import camera_fault
 from trihedron.pipeline.run.registration_check import RegistrationCheck
 
 log = logging.getLogger("trihedron")
@@ -133,6 +134,8 @@ class FrameValidation:
         configuration or the data set, and raised."""
         try:
             frame = read(position)
+            if isinstance(frame, Frame) and (fault := camera_fault(frame.camera)):
+                raise DataError(f"camera of frame {frame.index}", fault, "check the calibration of the data set")
         except (DataError, ValueError) as error:
             if position == 0:
                 raise

@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from pathlib import Path
 
-from trihedron.datasets.readers.cameras import Calibration, read_camera_file
+from trihedron.datasets.readers.cameras import Calibration, calibration_fault, read_camera_file
 from trihedron.datasets.readers.registration import DepthCamera
 from trihedron.pipeline.core import types
+from trihedron.pipeline.core.errors import DataError
 
 
 @dataclass(frozen=True)
@@ -29,6 +30,9 @@ class Camera(types.Camera):
         depth_radial: relative error of depth in the corners of the image; it grows with the squared distance from the centre.
         depth_camera: the separate camera of depth images that are not registered to colour.
 
+    Raises:
+        DataError: a number is one that no camera has, as a width of 0.
+
     Examples:
         >>> import numpy as np
         >>> import trihedron as th
@@ -44,6 +48,10 @@ class Camera(types.Camera):
     depth_offset: float = 0.0
     depth_radial: float = 0.0
     depth_camera: DepthCamera | None = None
+
+    def __post_init__(self) -> None:
+        if fault := calibration_fault(self.calibration):
+            raise DataError("camera", fault, "give the numbers of a calibration, in pixels")
 
     @classmethod
     def from_yaml(cls, path: str | Path) -> Camera:
@@ -70,7 +78,7 @@ class Camera(types.Camera):
         return cls.of(read_camera_file(Path(path).expanduser()))
 
     @classmethod
-    def of(cls, camera: types.Camera | Calibration) -> Camera:
+    def of(cls, camera: object) -> Camera:
         """Make a camera of a frame's, or of a data set's calibration.
 
         Args:
@@ -78,7 +86,13 @@ class Camera(types.Camera):
 
         Returns:
             A camera with the same intrinsics.
+
+        Raises:
+            DataError: it is neither.
         """
+        if not isinstance(camera, (types.Camera, Calibration)):
+            cure = 'give trihedron.Camera.from_yaml("camera.yaml"), or trihedron.Camera(width, height, fx, fy, cx, cy)'
+            raise DataError("camera", f"is {type(camera).__name__}, not a camera", cure)
         if isinstance(camera, cls):
             return camera
         pinhole = camera.camera if isinstance(camera, Calibration) else camera

@@ -9,22 +9,10 @@ from typing import Any
 import numpy as np
 
 from trihedron.camera import Camera
-from trihedron.datasets.readers.cameras import Calibration
 from trihedron.datasets.readers.images import metres
-from trihedron.pipeline.core import types
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.types import F32, U8, Frame
 from trihedron.pipeline.record.trajectories import parse_stamp_ns
-
-CAMERA = "camera"
-
-
-def camera_of(camera: object) -> Camera:
-    """Return the argument `camera`. Raises DataError naming it where it is none."""
-    if not isinstance(camera, (types.Camera, Calibration)):
-        cure = 'give trihedron.Camera.from_yaml("camera.yaml"), or trihedron.Camera(width, height, fx, fy, cx, cy)'
-        raise DataError(CAMERA, f"is {type(camera).__name__}, not a camera", cure)
-    return Camera.of(camera)
 
 
 class Frames:

@@ -23,7 +23,7 @@ from trihedron.buildings import Building
 from trihedron.camera import Camera
 from trihedron.datasets.readers.cameras import Calibration
 from trihedron.datasets.simulation.synthetic import Synthetic
-from trihedron.images import Frames, camera_of, stamp_of
+from trihedron.images import Frames, stamp_of
 from trihedron.pipeline.app.compilation import compile_once
 from trihedron.pipeline.app.execute import RECORDING, metadata_of, recorded_topics, remembered_of, source_of, write_files, write_models
 from trihedron.pipeline.app.viewers import Viewer, opened_viewer
@@ -107,7 +107,7 @@ class Slam:
 
     def __init__(self, camera: types.Camera | Calibration, *overrides: str, out: str | Path | None = None, history: int = 10, **options: Any) -> None:
         began = time.perf_counter()
-        self._frames = Frames(camera_of(camera))
+        self._frames = Frames(Camera.of(camera))
         words = words_of(overrides, options)
         _check_words(words)
         self._config = compose_run(["dataset=pushed", *words])

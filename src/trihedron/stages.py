@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from trihedron.camera import Camera
 from trihedron.datasets.readers.cameras import Calibration
-from trihedron.images import Frames, camera_of
+from trihedron.images import Frames
 from trihedron.pipeline.core import types
 from trihedron.pipeline.core.config import default_plugins
 from trihedron.pipeline.core.errors import ConfigError, UsageError, did_you_mean
@@ -160,7 +161,7 @@ class _Inputs:
         if arrays["depth"] is not None:
             if arrays[CAMERA] is None:
                 raise UsageError(f"{self._place}: camera", "is not given", "give trihedron.Camera(...) after the images")
-            self._values["frame"] = Frames(camera_of(arrays[CAMERA]))(self._index(), self._stamp(), arrays["rgb"], arrays["depth"])
+            self._values["frame"] = Frames(Camera.of(arrays[CAMERA]))(self._index(), self._stamp(), arrays["rgb"], arrays["depth"])
 
     def _place_argument(self, argument: Any, arrays: dict[str, Any]) -> None:
         """Put an argument without a name where its type belongs."""
@@ -222,7 +223,7 @@ class _Inputs:
             return frame.camera
         if self._camera is None:
             raise UsageError(f"{self._place}: camera", "is not given", "give trihedron.Camera(...)")
-        return camera_of(self._camera).calibration.camera
+        return Camera.of(self._camera).calibration.camera
 
     def _index(self) -> int:
         return max((value.index for value in self._values.values() if isinstance(value, Value)), default=0)

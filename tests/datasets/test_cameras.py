@@ -61,11 +61,20 @@ BAD = [
     (GOOD.replace("501.5", "-480"), "{}: fy is negative (y up); give it positive; dataset=icl_nuim reflects the published poses itself"),
     (GOOD.replace("640", "640.5"), "{}: width is 640.5; give a positive whole number"),
     (GOOD.replace("1000", "0"), "{}: depth_scale is 0; give a positive number"),
+    (GOOD.replace("fx: 500", "fx: 2e6"), "{}: fx is not within 0.001 … 1e+06; give the numbers of a calibration, in pixels"),
+    (GOOD + "fps: 1e7\n", "{}: fps is not within 1e-06 … 1e+06; give the numbers of a calibration, in pixels"),
+    (
+        GOOD + "distortion: [0, 0, 0, 0, 1e10]\n",
+        "{}: distortion holds coefficients that are not within ±100; give the numbers of a calibration, in pixels",
+    ),
     (GOOD + "depth_noise: kinnect\n", "{}: depth_noise is 'kinnect'; did you mean 'kinect'?"),
     (GOOD + "depth_radial: 0.6\n", "{}: depth_radial is 0.6; give a relative error within ±0.5"),
     (GOOD + "depth_camera: 580\n", "{}: depth_camera holds no keys; give it fx fy cx cy translation_m rotation_deg"),
     (GOOD + "depth_camera: {fx: 580, fy: 580, cx: 320}\n", "{}: the key 'depth_camera.cy' is missing; give it fx fy cx cy"),
-    (GOOD + "depth_camera: {fx: 0, fy: 580, cx: 320, cy: 240}\n", "{}: depth_camera describes no camera; give fx and fy above 1e-06"),
+    (
+        GOOD + "depth_camera: {fx: 0, fy: 580, cx: 320, cy: 240}\n",
+        "{}: depth_camera.fx is not within 0.001 … 1e+06; give the numbers of a calibration, in pixels",
+    ),
     (
         GOOD + "depth_camera: {fx: 580, fy: 580, cx: 320, cy: 240, translation_m: 0.025}\n",
         "{}: depth_camera.translation_m does not hold 3 numbers; give a list [x, y, z]",

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.types import Camera, Frame
 from trihedron.pipeline.run.frame_validation import FrameValidation, constant_share
 
@@ -90,3 +91,10 @@ def test_share_of_equal_readings():
     assert constant_share(depth) == 0.0  # one reading is nothing to judge by
     depth[:40], depth[40:] = 2.0, 3.0
     assert constant_share(depth) == 0.5
+
+
+def test_a_camera_that_cannot_be_recorded_is_refused_at_the_first_frame():
+    frame = Frame(0, 0, np.zeros((120, 160, 3), np.uint8), np.ones((120, 160), np.float32), replace(CAMERA, fps=1e7))
+    with pytest.raises(DataError) as error:
+        FrameValidation({}, 1)(0, lambda position: frame, lambda: 0)
+    assert str(error.value) == "camera of frame 0: fps is not within 1e-06 … 1e+06; check the calibration of the data set"

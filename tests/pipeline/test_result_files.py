@@ -120,3 +120,14 @@ def test_a_job_whose_state_was_cut_off_is_done_again(tmp_path):
     for text in ("", "[]", '{"state": 3}', "[" * 100_000):
         (tmp_path / "job.json").write_text(text)
         assert read_job(tmp_path) == {}
+
+
+def test_a_folder_whose_name_is_not_utf_8_is_read_again(tmp_path):
+    """File names are bytes; Python holds one that is no UTF-8 as a surrogate, which libyaml and UTF-8 refuse."""
+    first, again = (os.fsdecode(os.fsencode(tmp_path) + name) for name in (b"/r\xff", b"/again\xff"))
+    words = ["dataset=synthetic", "dataset.width=160", "dataset.height=120", "dataset.length=4"]
+    assert main(["run", *words, f"out={first}"]) == 0
+    assert main(["run", f"replay={first}/run.mcap", "only=[rotation]", f"out={again}"]) == 0
+    assert main(["compare", first, again]) == 0
+    assert main(["report", first, again, "--out", str(tmp_path / "report.html")]) == 0
+    assert "r?" in (tmp_path / "report.html").read_text(encoding="utf-8")

@@ -45,6 +45,14 @@ def test_names_of_runs_are_escaped(page, tmp_path):
     assert "<script>alert" not in text and "script>&<" not in text
 
 
+def test_a_name_does_not_swallow_the_rest_of_a_report(page, tmp_path):
+    """Behind `<!--<script>` an HTML parser ends no script any more; U+2028 ends a line of JavaScript."""
+    shutil.copytree(page.parent / "1", tmp_path / "<!--<script>\u2028")
+    assert main(["report", str(tmp_path / "<!--<script>\u2028"), "--out", str(tmp_path / "page.html")]) == 0
+    [scene] = re.findall(r'id="scene">(.*?)</script>', (tmp_path / "page.html").read_text())
+    assert not set("<>&\u2028") & set(scene) and json.loads(scene)["paths"][0]["name"] == "<!--<script>\u2028"
+
+
 def test_the_building_of_a_run_is_drawn(tmp_path):
     words = ["dataset.scene=flat", "dataset.fps=10", "dataset.width=160", "dataset.height=120", "dataset.length=8", "outputs=[trajectory,building]"]
     assert main(["run", *words, f"out={tmp_path / 'flat'}"]) == 0
