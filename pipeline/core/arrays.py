@@ -9,6 +9,8 @@ from typing import Annotated, Any, ClassVar, get_args, get_origin, get_type_hint
 import numpy as np
 from numpy.typing import NDArray
 
+from trihedron.pipeline.core.described import Described
+
 F64 = NDArray[np.float64]
 F32 = NDArray[np.float32]
 I32 = NDArray[np.int32]
@@ -71,7 +73,7 @@ def check_arrays(value: Any) -> None:
 
 
 @dataclass(frozen=True)
-class Value:
+class Value(Described):
     """Base of everything on a wire."""
 
     version: ClassVar[int] = 1  # of the type's fields; a recording made with another one is refused

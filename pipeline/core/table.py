@@ -16,6 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from trihedron.pipeline.core.described import Described
+
 Array = NDArray[Any]
 CHUNK = 256  # rows whose memory is freed together
 GROWTH = 1.5
@@ -61,7 +63,7 @@ class _Buffer:
 
 
 @dataclass(frozen=True)
-class Table:
+class Table(Described):
     """Rows 0..size-1 in named columns; a row's number is its identity and is never given to another.
 
     `freed` are the numbers of the chunks of `CHUNK` rows that were freed: their rows are zero."""

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from trihedron.pipeline.core import conversions
 from trihedron.pipeline.core.arrays import F32, F64, I32, U8, Bool, Shape, Value
 from trihedron.pipeline.core.constraints import Columns, CoversImage, Finite, IndexInto, OneOf, Rotations, SameWidth, UnitNormals, Within
+from trihedron.pipeline.core.described import Described
 from trihedron.pipeline.core.table import Column, Table
 
 __all__ = [
@@ -363,7 +364,7 @@ class PredictedView(Value):
 
 
 @dataclass(frozen=True)
-class Trajectory:
+class Trajectory(Described):
     """Poses over time: (n,) stamps in ns, strictly increasing, and (n, 4, 4) `T_world_camera`."""
 
     stamps_ns: NDArray[np.int64]

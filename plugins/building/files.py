@@ -13,6 +13,7 @@ from xml.sax.saxutils import escape
 
 import numpy as np
 
+from trihedron.pipeline.core.descriptions import summary_of_building
 from trihedron.pipeline.core.files import new_file, write_file
 from trihedron.pipeline.core.linalg import norm
 from trihedron.pipeline.core.registry import register_files
@@ -48,15 +49,7 @@ def write_building(out: Path, building: Building) -> list[str]:
 
 def summary(building: Building) -> str:
     """Return a line that describes a building."""
-    counts = [
-        (len(building.storeys), "storey"),
-        (len(building.areas_m2), "room"),
-        (len(building.walls_m), "wall"),
-        (len(building.spans_m), "opening"),
-    ]
-    counted = ", ".join(f"{count} {name}{'s' if count != 1 else ''}" for count, name in counts)
-    area = f" of {building.areas_m2.sum():.2f} ± {np.sqrt(building.area_variance.sum()):.2f} m²" if len(building.areas_m2) else ""
-    return f"building: {counted}{area}" + (f"; {building.note}" if building.note else "")
+    return f"building: {summary_of_building(building)}"
 
 
 # JSON.

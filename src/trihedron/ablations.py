@@ -25,6 +25,9 @@ class Ablation:
     folders: dict[str, list[Path]]
     text: str
 
+    def __repr__(self) -> str:
+        return "\n".join([f"Ablation({len(self.folders)} alternatives; {len(self.tables)} tables)", *self.verdicts])
+
     def __str__(self) -> str:
         return self.text
 

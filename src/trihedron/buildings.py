@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from trihedron.pipeline.core import types
+from trihedron.pipeline.core.described import Described
 from trihedron.pipeline.core.errors import DataError, UsageError
 from trihedron.pipeline.core.linalg import matmul, norm
 from trihedron.pipeline.core.types import F64, OPENING_KINDS, Pose
@@ -30,7 +31,7 @@ class Measurement:
     def __float__(self) -> float:
         return self.value
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         return f"{self.value:.3f} ± {self.sigma:.3f}"
 
 
@@ -44,7 +45,7 @@ class Storey:
 
 
 @dataclass(frozen=True)
-class Wall:
+class Wall(Described):
     """A wall: the ends (2,) of its face, with the side it was seen from on the left; length, thickness and the standard deviation of the face's
     offset, m; the stretches (n, 2) along it that were not seen."""
 
@@ -69,7 +70,7 @@ class Wall:
 
 
 @dataclass(frozen=True)
-class Edge:
+class Edge(Described):
     """An edge of a room between two corners (2,), with the room on its left; `wall` is None where nothing bounds what was seen."""
 
     start: F64
@@ -79,7 +80,7 @@ class Edge:
 
 
 @dataclass(frozen=True)
-class Room:
+class Room(Described):
     """A room: corners (n, 2) anticlockwise, those of holes the other way, the edges of all, area (m²) and perimeter (m) of the outer ring, the
     numbers of its openings; `closed` if a wall was seen all round."""
 
@@ -95,7 +96,7 @@ class Room:
 
 
 @dataclass(frozen=True)
-class Opening:
+class Opening(Described):
     """A `door`, `passage` or `window` in a wall: middle (3,) in the building's frame, width and height, m, and the rooms it joins (None: none)."""
 
     number: int
@@ -216,9 +217,13 @@ class Building:
             raise DataError(str(error.filename or out), f"cannot be written: {error.strerror}", "give another folder") from error
 
     def __repr__(self) -> str:
-        from trihedron.plugins.building.files import summary
+        return repr(self.plan)
 
-        return f"Building({summary(self.plan).removeprefix('building: ')})"
+    def _repr_html_(self) -> str | None:
+        from trihedron.pipeline.core.pictures import html_of
+        from trihedron.plugins.building.picture import picture_of_building
+
+        return html_of(self.plan, picture_of_building(self.plan))
 
     def _point(self, thing: Any, place: str) -> tuple[F64, F64]:
         """Return a point (3,) in the building's frame and its covariance (3, 3)."""

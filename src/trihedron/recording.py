@@ -239,4 +239,4 @@ class Recording:
         return ablate(self.path, *swaps, out=out, feedback=feedback, budget=budget, **options)
 
     def __repr__(self) -> str:
-        return f"Recording({str(self.path)!r}, {len(self._references)} frames, topics {', '.join(self.topics)})"
+        return f"Recording({self.path}; {len(self._references)} frames; {len(self.topics)} topics)"

@@ -43,6 +43,11 @@ class Run:
         """The plan of the building."""
         return self.recording.building
 
+    def __repr__(self) -> str:
+        status = ", ".join(f"{count} {name}" for name, count in self.metrics.get("status", {}).items() if count)
+        ate_m = self.metrics.get("final", {}).get("ate_rmse_m")
+        return f"Run({'; '.join([str(self.folder), *([status] if status else []), *([f'ATE {1e3 * ate_m:.3g} mm'] if ate_m is not None else [])])})"
+
     def table(self) -> Any:
         """Return the metrics, one row a figure, as `figure` and `value`: a pandas DataFrame where pandas is installed, else a list of dicts."""
         rows = [{"figure": name, "value": value} for name, value in flatten_dict(self.metrics).items()]

@@ -28,7 +28,7 @@ from trihedron.pipeline.app.compilation import compile_once
 from trihedron.pipeline.app.execute import RECORDING, metadata_of, recorded_topics, remembered_of, source_of, write_files, write_models
 from trihedron.pipeline.app.viewers import Viewer, opened_viewer
 from trihedron.pipeline.core import types
-from trihedron.pipeline.core.config import check_added, compose_run, graph_of
+from trihedron.pipeline.core.config import RerunView, check_added, compose_run, graph_of
 from trihedron.pipeline.core.errors import ConfigError, UsageError, did_you_mean
 from trihedron.pipeline.core.graph import Graph
 from trihedron.pipeline.core.types import FrameReference, Map, Surface, Value
@@ -257,6 +257,32 @@ class Slam:
         return finished
 
     @_of_one_thread
+    def show(self, port: int = RerunView.port, web_port: int = RerunView.web_port) -> None:
+        """Show the run in rerun, as `view=rerun view.web=true` does: a page of this machine, whose address is printed. It has what there is now, then
+        each further frame until `close`.
+
+        Args:
+            port: of the data.
+            web_port: of the page.
+
+        Raises:
+            LibraryError: rerun is not installed.
+            ConfigError: a port is in use.
+            UsageError: the object is closed, or another thread is using it.
+        """
+        self._check_open()
+        self._settle()
+        words = ["view=rerun", "view.web=true", f"view.port={port}", f"view.web_port={web_port}"]
+        viewer = self._stack.enter_context(opened_viewer(compose_run(words)))
+        values = {name: self._value(name) for name in self._values} | {"map": self._runner.result.map}
+        values |= {name: self._fold(name, preview=True) for name in {"surface", "building"} & set(self._values)}
+        for sink in viewer.sinks:
+            for name, value in values.items():
+                if value is not None:
+                    sink.preview(name, value)
+        self._runner.sinks = (*self._runner.sinks, *viewer.sinks)
+
+    @_of_one_thread
     def save(self, path: str | Path) -> None:
         """Write a recording: all of it so far where frames are streamed to `out`; else all poses, the surface so far, and the images and values of
         the last `history` frames.
@@ -438,6 +464,9 @@ class Values(Mapping[str, Any]):
 
     def __len__(self) -> int:
         return len(self._stages)
+
+    def __repr__(self) -> str:
+        return f"Values({', '.join(self._stages)})"
 
 
 def _check_words(words: list[str]) -> None:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import sys
 import zlib
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, get_type_hints
 
 import numpy as np
 
@@ -14,8 +15,10 @@ from trihedron.camera import Camera
 from trihedron.datasets.readers.cameras import Calibration
 from trihedron.images import Frames
 from trihedron.pipeline.core import types
+from trihedron.pipeline.core.comments import field_comments
 from trihedron.pipeline.core.config import default_plugins
 from trihedron.pipeline.core.errors import ConfigError, UsageError, did_you_mean
+from trihedron.pipeline.core.options import constraints_of
 from trihedron.pipeline.core.registry import load_plugins, options_of, parameters_of_method, plugin_class, plugins_of
 from trihedron.pipeline.core.slots import CAMERA, FOLDS, RNG, accepts_none, default_wires, inputs_of, strip_none, summary
 from trihedron.pipeline.core.types import Frame, Value
@@ -53,7 +56,11 @@ class StageFactory:
 
     def __init__(self, slot: str, name: str, kind: type[Any]) -> None:
         self._slot, self._name, self._kind = slot, name, kind
-        self.__doc__ = kind.__doc__
+        options = options_of(kind)
+        self.__doc__ = "\n\n".join([inspect.getdoc(kind) or "", *(["Args:\n" + "\n".join(_described(kind))] if options else [])])
+        hints, keyword = get_type_hints(kind), inspect.Parameter.KEYWORD_ONLY
+        parameters = [inspect.Parameter(option.name, keyword, default=_default(option), annotation=hints[option.name]) for option in options]
+        self.__signature__ = inspect.Signature(parameters, return_annotation=kind if slot == "dataset" else Stage)
 
     def __call__(self, **options: Any) -> Any:
         """Make the stage.
@@ -79,8 +86,22 @@ class StageFactory:
         return plugin if self._slot == "dataset" else Stage(self._slot, self._name, plugin)
 
     def __repr__(self) -> str:
-        options = ", ".join(f"{option.name}={getattr(option, 'default', '')!r}" for option in options_of(self._kind))
+        options = ", ".join(f"{option.name}={_default(option)!r}" for option in options_of(self._kind))
         return f"trihedron.{self._slot}.{self._name}({options})"
+
+
+def _default(option: dataclasses.Field[Any]) -> Any:
+    """Return the default of an option, `Parameter.empty` where it has none."""
+    if option.default_factory is not dataclasses.MISSING:
+        return option.default_factory()
+    return inspect.Parameter.empty if option.default is dataclasses.MISSING else option.default
+
+
+def _described(kind: type[Any]) -> list[str]:
+    """Return a line for each option of a plugin: its comment and range."""
+    comments, ranges = field_comments(kind), constraints_of(kind)
+    texts = {option.name: [comments.get(option.name, ""), " and ".join(map(str, ranges.get(option.name, ())))] for option in options_of(kind)}
+    return [f"    {name}: {'; '.join(filter(None, text)) or 'see above'}." for name, text in texts.items()]
 
 
 class Stage:

@@ -382,7 +382,7 @@ def test_the_plugin_package_of_the_readme_is_one_word_away(tmp_path):
     site = tmp_path / "site"
     install = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--no-build-isolation", "--no-index", "--target", str(site), str(package)]
     subprocess.run(install, check=True, capture_output=True)
-    environment = {**os.environ, "PYTHONPATH": str(site)}
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(site), os.environ.get("PYTHONPATH", "")])}
 
     def trihedron(*words):
         return subprocess.run([*PROGRAM, *words], env=environment, capture_output=True, text=True)

@@ -12,7 +12,8 @@ import sys
 import threading
 import time
 import urllib.request
-from contextlib import nullcontext
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from websockets.sync.client import connect
 import trihedron as th
 from trihedron.datasets.simulation.synthetic import Synthetic
 from trihedron.pipeline.app.cli import main
+from trihedron.pipeline.app.viewers import Viewer
 from trihedron.pipeline.core.types import Map, Surface
 from trihedron.pipeline.record.foxglove_server import FoxgloveServer
 from trihedron.pipeline.record.rerun_viewer import RerunViewer
@@ -179,6 +181,43 @@ def test_a_slow_viewer_does_not_slow_the_run() -> None:
     stream.go.set()
     sink.close()
     assert stream.logged > 0
+
+
+def test_show_opens_rerun_during_a_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It gets what there is so far, each further frame, and the surface at the end, when it is closed."""
+    seen: list[str] = []
+
+    class Sink:
+        def frame(self, index: int, stamp_ns: int, values: Any, times: Any) -> None:
+            seen.append(f"frame {index}")
+
+        def preview(self, name: str, value: Any) -> None:
+            seen.append(f"preview {name} {value.index}")
+
+        def fold(self, name: str, value: Any) -> None:
+            seen.append(f"fold {name}")
+
+    @contextmanager
+    def opened(config: Any) -> Iterator[Viewer]:
+        if config.view is None:
+            yield Viewer()
+            return
+        assert (config.view.viewer, config.view.web, config.view.port, config.view.web_port) == ("rerun", True, 1, 2)
+        yield Viewer(sinks=(Sink(),))  # type: ignore[arg-type]
+        seen.append("closed")
+
+    monkeypatch.setattr("trihedron.slam.opened_viewer", opened)
+    with th.Slam(ROOM(0).camera, threads=1, outputs=["trajectory", "surface"]) as slam:
+        for k in range(3):
+            slam.track(ROOM(k).color, ROOM(k).depth_m, ROOM(k).stamp_ns / 1e9)
+            if k == 1:
+                slam.show(port=1, web_port=2)
+                so_far, seen = seen, []
+    assert {"preview dataset 1", "preview pose 1", "preview planes 1", "preview surface 1"} <= set(so_far)
+    assert any(line.startswith("preview map ") for line in so_far)
+    assert seen == ["frame 2", "fold surface", "closed"]
+    with pytest.raises(th.TrihedronError, match="Slam: is closed"):
+        slam.show()
 
 
 @pytest.mark.slow

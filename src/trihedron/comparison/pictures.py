@@ -9,11 +9,9 @@ from typing import TYPE_CHECKING, Any
 from trihedron.pipeline.core.files import new_file
 
 if TYPE_CHECKING:
-    from trihedron.pipeline.core.types import Camera, Map, Planes
+    from trihedron.pipeline.core.types import Camera, Map
     from trihedron.pipeline.record.reader import Recording
 
-AXIS_COLORS = ((220, 50, 50), (50, 170, 50), (60, 90, 230))
-AXIS_LENGTH_PX = 60
 SIZE_INCHES, DPI = (16, 6.4), 120  # 1920 × 768 px
 FRAMED = (0.5, 99.5)  # percentiles of the landmarks between two edges of the map, which holds 98 % of them
 MARGIN_M = 0.2
@@ -89,8 +87,9 @@ def _value(recordings: Sequence[Recording], topic: str, stamp_ns: int) -> Any:
 
 def _annotate_frame(recordings: Sequence[Recording], frame: int) -> Any:
     """The frame's image (the nearest one that was kept to look at) with the features of that very frame."""
-    import cv2
     import numpy as np
+
+    from trihedron.pipeline.core.pictures import draw_axes, draw_keypoints, draw_lines, tint_planes
 
     reference = recordings[-1].reference(frame)
     assert reference is not None, "the frame is one of the recording's"
@@ -99,16 +98,13 @@ def _annotate_frame(recordings: Sequence[Recording], frame: int) -> Any:
     topics = ("planes", "segments", "keypoints", "manhattan")
     values: dict[str, Any] = {topic: _value(recordings, topic, reference.stamp_ns) for topic in topics}
     if values["planes"] is not None:
-        image = _tint_planes(image, values["planes"])
+        image = tint_planes(image, values["planes"])
     if values["segments"] is not None:
-        lifted = np.isfinite(values["segments"].endpoints_m).all(axis=(1, 2))
-        for ends, in_space in zip(np.rint(values["segments"].endpoints_px).astype(int), lifted):
-            cv2.line(image, tuple(map(int, ends[0])), tuple(map(int, ends[1])), (255, 230, 0) if in_space else (150, 150, 150), 2, cv2.LINE_AA)
+        draw_lines(image, values["segments"].endpoints_px, np.isfinite(values["segments"].endpoints_m).all(axis=(1, 2)))
     if values["keypoints"] is not None:
-        for x, y in np.rint(values["keypoints"].pixels).astype(int):
-            cv2.circle(image, (int(x), int(y)), 2, (0, 230, 120), 1, cv2.LINE_AA)
+        draw_keypoints(image, values["keypoints"].pixels)
     if values["manhattan"] is not None and values["manhattan"].supported:
-        _axes(image, values["manhattan"].rotations[0])
+        draw_axes(image, values["manhattan"].rotations[0])
     return image
 
 
@@ -136,28 +132,6 @@ def _image(recording: Recording, stamp_ns: int, camera: Camera) -> Any:
     except UnreadableImage as error:
         raise RecordingError(str(recording.path), f"topic /view/image: an image {error}", "the file is damaged; record it again") from error
     return cv2.resize(small, (camera.width, camera.height))
-
-
-def _tint_planes(image: Any, planes: Planes) -> Any:
-    import cv2
-    import numpy as np
-    from matplotlib import colormaps
-
-    height, width = image.shape[:2]
-    labels = cv2.resize(planes.labels, (width, height), interpolation=cv2.INTER_NEAREST)
-    palette = np.vstack([[0, 0, 0], 255 * np.array([colormaps["tab20"](i % 20)[:3] for i in range(255)])])
-    mixed = np.where(labels[..., None] > 0, 0.55 * image + 0.45 * palette[labels], image)
-    return np.ascontiguousarray(mixed.astype(np.uint8))
-
-
-def _axes(image: Any, R_camera_manhattan: Any) -> None:
-    """The three axes as arrows in the lower left corner."""
-    import cv2
-
-    origin = (AXIS_LENGTH_PX + 15, image.shape[0] - AXIS_LENGTH_PX - 15)
-    for axis, color in enumerate(AXIS_COLORS):
-        x, y = R_camera_manhattan[:2, axis] * AXIS_LENGTH_PX
-        cv2.arrowedLine(image, origin, (round(origin[0] + x), round(origin[1] + y)), color, 3, cv2.LINE_AA, tipLength=0.2)
 
 
 def _map_from_above(axes: Any, recording: Recording, poses: list[Any]) -> None:
