@@ -5,7 +5,7 @@ import pytest
 from trihedron.pipeline.app.cli import main
 
 TYPE, SEE = "give a value of that type", "see trihedron plugins"
-WRITE = "write key=value, for example threads=1 (quote lists: 'only=[pose]')"
+NO_PATH = "is not key=value, and there is no such path in {here}; give a folder, a .mcap or .bag file, or key=value (quote lists: 'only=[pose]')"
 MCAP = "is not an MCAP file; give a file that trihedron run or another MCAP writer wrote"
 MISTAKES = [  # words of the command, exit code, what is said after "trihedron: "
     ("run threads=abc", 1, f"threads: Value 'abc' of type 'str' could not be converted to Integer; {TYPE}"),
@@ -60,14 +60,14 @@ MISTAKES = [  # words of the command, exit code, what is said after "trihedron: 
     ("run out=text.txt/x", 1, "out: the folder cannot be made: Not a directory: {here}/text.txt/x; give another out=FOLDER"),
     ("run out=", 2, "out=: lacks a folder; write key=value, for example out=runs/mine"),
     ("run =3", 2, "=3: lacks a key; write key=value, for example out=runs/mine"),
-    ("run a b", 2, f"a: is not an override; {WRITE}"),
-    ("run dataset.path", 2, f"dataset.path: is not an override; {WRITE}"),
+    ("run a b", 2, f"a: {NO_PATH}"),
+    ("run dataset.path", 2, f"dataset.path: {NO_PATH}"),
     ("run --dry-run", 2, "--dry-run: is of a sweep, and this is one run; add -m to run once with each of several values"),
     ("run --verbose", 2, "--verbose: is not an option of run; known: -m, --multirun, --dry-run; everything else is key=value"),
     ("topics nowhere.mcap", 1, "nowhere.mcap: cannot be read: No such file or directory; give the path of an MCAP file"),
     ("topics junk.mcap", 1, f"junk.mcap: {MCAP}"),
     ("evaluate text.txt", 2, "evaluate: the following arguments are required: TRUTH; see trihedron evaluate --help"),
-    ("evaluate-surface small", 1, "small/surface.ply: there is no such file; run with outputs=[trajectory,surface] first"),
+    ("evaluate-surface small", 1, "small/surface.ply: there is no such file; run with 'outputs=[trajectory,surface]' first"),
     ("picture small/run.mcap --frame 99", 1, "small/run.mcap: has no frame 99; give one of 0..3"),
     ("picture small/run.mcap --frame x", 2, "picture: argument --frame: invalid int value: 'x'; see trihedron picture --help"),
     ("calibrate junk.mcap", 1, f"junk.mcap: {MCAP}"),

@@ -17,7 +17,8 @@ matching beside OpenCV's), `trihedron benchmark recording` (what recording costs
 and `trihedron benchmark faults` (how honest status and covariances are on simulated sensors of several kinds and under degenerate input), `trihedron
 benchmark honesty` (both in one table, with recorded sequences).
 
-`trihedron compare` makes a table of the runs of any sweep.
+`trihedron compare` makes a table of the runs of any sweep. Overrides are those of `trihedron run --help`, where data sets, graphs and the groups
+`without=` and `experiment=` are listed; relative paths begin in the working folder, and nothing else is searched.
 
 Example: trihedron benchmark FOLDER dataset.frames=0:150 --json benchmark.json
 Example: trihedron benchmark FOLDER --peers --peer-python orbslam3/bin/python --vocabulary ORBvoc.txt

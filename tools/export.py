@@ -3,7 +3,7 @@
 RUN is a run folder or its recording. Lengths are metres. tum and kitti are the final trajectory, csv is a row for each frame, colmap a model with its
 images, rerun what `trihedron view` shows, all in the world of trajectory.txt. Meshes are
 turned so that up, an axis of the Manhattan frame, is +z (ply, obj,
-planes.json) or +y (gltf, by its standard), and what the first camera saw is ahead: +y, or -z.
+planes.json) or +y (gltf, a .glb file, by its standard), and what the first camera saw is ahead: +y, or -z.
 With --covariance, tum is the poses as they were estimated at the time, and a file
 beside it (.cov) their covariances, which smfeval judges.
 
@@ -22,6 +22,7 @@ from trihedron.pipeline.record.reader import Recording
 from trihedron.tools.arguments import Parser
 
 RECORDING = "run.mcap"
+BY_ENDING = {"glb": "gltf", "rrd": "rerun"}  # endings of files that are given for the names of their formats
 
 
 @dataclass(frozen=True)
@@ -46,13 +47,14 @@ def main(argv: list[str]) -> int:
     """Run the command; returns the exit code. Raises UsageError for wrong arguments, DataError for a run that lacks what is to be written."""
     parser = Parser("export", __name__)
     parser.add_argument("run", metavar="RUN", type=Path, help="a run folder or its recording")
-    parser.add_argument("--to", metavar="FORMAT", required=True, help=f"one of {', '.join(formats())}")
+    parser.add_argument("--to", metavar="FORMAT", required=True, help=f"one of {', '.join(formats())}; glb and rrd too")
     parser.add_argument("--out", metavar="FILE", type=Path, help="(default: in the run folder)")
     parser.add_argument("--covariance", action="store_true", help="with the covariance of each pose (tum)")
     arguments = parser.parse_args(argv)
-    if arguments.to not in formats():
-        raise UsageError("export", f"there is no format '{arguments.to}'", did_you_mean(arguments.to, formats()))
-    chosen = formats()[arguments.to]
+    name = BY_ENDING.get(arguments.to, arguments.to)
+    if name not in formats():
+        raise UsageError("export", f"there is no format '{name}'", did_you_mean(name, formats()))
+    chosen = formats()[name]
     if arguments.covariance:
         if chosen.covariance is None:
             able = ", ".join(format.name for format in formats().values() if format.covariance)

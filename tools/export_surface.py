@@ -31,7 +31,7 @@ def surface_of(recording: Recording) -> Surface:
     if "surface" in recording.topics:
         found = next((value for value in recording.values("surface") if isinstance(value, Surface)), None)
     if found is None:
-        raise DataError(str(recording.path), "holds no surface", "run with outputs=[trajectory,surface]")
+        raise DataError(str(recording.path), "holds no surface", "run with 'outputs=[trajectory,surface]'")
     return found
 
 

@@ -46,7 +46,7 @@ def page(runs: Sequence[Run], title: str | None = None) -> str:
     """The whole page, under a title. Raises DataError when no run has a trajectory."""
     named = {name: run for name, run in zip(_names(runs), runs) if all((run.folder / file).exists() for file in (RECORDING, TRAJECTORY))}
     if not named:
-        raise DataError(str(runs[0].folder), "none of the runs has a trajectory", "run with outputs=[trajectory]")
+        raise DataError(str(runs[0].folder), "none of the runs has a trajectory", "run with 'outputs=[trajectory]'")
     facts = {name: facts_of(run) for name, run in named.items()}
     header, cells = run_tables.cells_of(rows_of(runs))
     return render(

@@ -46,15 +46,18 @@ RUN_HELP = """Track a sequence: compose the configuration, run the graph, write 
 Usage: trihedron run [-m] [key=value ...]
 
   FOLDER | FILE.mcap | FILE.bag      what to track; the data set is known by its files, else: dataset=NAME dataset.path=FOLDER
+                                     a relative path begins in the working folder; nothing else is searched
   dataset=NAME                       {datasets}
   dataset.frames=A:B                 half-open range of frames       dataset.camera=PRESET|FILE  the camera
   graph=NAME                         {graphs}
+  without=PART                       {without}
+  experiment=NAME (with -m)          {experiments}
   STAGE=PLUGIN STAGE.OPTION=VALUE    swap a method, set its options (trihedron plugins lists them all)
   graph.STAGE.INPUT=TOPIC            change a wire: topic, topic@prev or topic@5
-  outputs=[trajectory]               what must be computed           threads=2  seed=0
+  'outputs=[trajectory]'             what must be computed           threads=2  seed=0
   out=FOLDER                         the run folder (default runs/<date>/<time>; runs/latest points at the newest)
-  record.topics=[normals]            record dense topics too         record.frames=true  embed the input frames
-  replay=FILE.mcap only=[STAGE,...]  compute these stages again, read the rest from a recording
+  'record.topics=[normals]'          record dense topics too         record.frames=true  embed the input frames
+  replay=FILE.mcap 'only=[STAGE]'    compute these stages again, read the rest from a recording
   save_map=FILE.mcap                 keep the map, to go on from    load_map=FILE.mcap  go on from it, or find the camera in it
   localise_only=true                 the loaded map stays as it is
   view=foxglove | view=rerun         watch the run; view.web=true serves rerun to a browser; view.port=8765, view.host=127.0.0.1
@@ -64,12 +67,12 @@ Usage: trihedron run [-m] [key=value ...]
   feedback=recorded                  each recomputed stage by itself: all its inputs are as recorded
   -m                                 sweep over comma-separated values, on all cores; the same again does what is missing
   -m ... --dry-run                   say which jobs a sweep has, which are done, and which stages they share; run nothing
-  sequences=[KIND:FOLDER,...]        of a sweep: several data sets, for example ["tum:/data/desk frames=0:300",synthetic]
+  'sequences=[KIND:FOLDER,...]'      of a sweep: several data sets, for example 'sequences=["tum:/data/desk frames=0:300",synthetic]'
   hydra/launcher=dask                of a sweep: on a cluster; hydra/sweeper=optuna: a search (README)
   report=COMMAND                     what to do with the folder of a sweep at its end, for example: report="benchmark methods"
 
 Example: trihedron run rgbd_dataset_freiburg3_structure_notexture_far
-Example: trihedron run replay=runs/latest/run.mcap only=[manhattan,rotation] manhattan.cone_deg=8"""
+Example: trihedron run replay=runs/latest/run.mcap 'only=[manhattan,rotation]' manhattan.cone_deg=8"""
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -216,8 +219,16 @@ def run_help() -> str:
     from trihedron.pipeline.core.registry import load_plugins, plugins_of
 
     load_plugins()
-    graphs = sorted(entry.name.removesuffix(".yaml") for entry in (files("trihedron.conf") / "graph").iterdir() if entry.name.endswith(".yaml"))
-    return RUN_HELP.format(datasets=_list_names(plugins_of("dataset"), "synthetic"), graphs=_list_names(graphs, "structural"))
+    groups = {
+        group: sorted(entry.name.removesuffix(".yaml") for entry in (files("trihedron.conf") / group).iterdir() if entry.name.endswith(".yaml"))
+        for group in ("graph", "without", "experiment")
+    }
+    return RUN_HELP.format(
+        datasets=_list_names(plugins_of("dataset"), "synthetic"),
+        graphs=_list_names(groups["graph"], "structural"),
+        without=", ".join(groups["without"]),
+        experiments=", ".join(groups["experiment"]),
+    )
 
 
 def _list_names(names: Iterable[str], default: str) -> str:
@@ -227,10 +238,15 @@ def _list_names(names: Iterable[str], default: str) -> str:
 
 
 def _data_set(word: str) -> list[str]:
-    """A word of run as overrides: a path chooses the data set, and prints which."""
-    from trihedron.pipeline.core.layouts import data_set_words
+    """A word of run as overrides: a path chooses the data set, and prints which. Raises UsageError for a word that is neither."""
+    from trihedron.pipeline.core.layouts import BAG, RECORDING, data_set_words
 
     words = data_set_words(word)
+    if words == [word] and "=" not in word and not word.startswith(("-", "~", "+")):
+        searched = "there is no such path" if Path(word).is_absolute() else f"there is no such path in {Path.cwd()}"
+        raise UsageError(
+            word, f"is not key=value, and {searched}", f"give a folder, a {RECORDING} or {BAG} file, or key=value (quote lists: 'only=[pose]')"
+        )
     if words != [word]:
         print(*words, file=sys.stderr)
     return words

@@ -37,7 +37,7 @@ def poses_of(recording: Recording) -> list[Pose]:
     """The poses as they were estimated at the time. Raises DataError when there are none."""
     poses = [value for value in _values(recording, "pose") if isinstance(value, Pose)]
     if not poses:
-        raise DataError(str(recording.path), "holds no poses", "record a run with outputs=[trajectory]")
+        raise DataError(str(recording.path), "holds no poses", "record a run with 'outputs=[trajectory]'")
     return poses
 
 

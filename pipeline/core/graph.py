@@ -159,5 +159,5 @@ def _targets(graph: Graph) -> list[str]:
         else:
             raise GraphError("outputs", f"no stage writes '{output}'", did_you_mean(output, [TRAJECTORY, *graph.stages]))
     if not targets:
-        raise GraphError("outputs", "is empty, so nothing would run", "give outputs=[trajectory]")
+        raise GraphError("outputs", "is empty, so nothing would run", "give 'outputs=[trajectory]'")
     return targets

@@ -85,7 +85,7 @@ def check_together(inputs: Mapping[str, Any], place: str, topics: Mapping[str, s
             if cause := _fault_together(getattr(value, name), constraint, value, _of_its_time(parameter, value, inputs)):
                 topic = topics.get(parameter, parameter)
                 others = any(topics.get(other) in computed for other in inputs)
-                cure = f"compute it again too, with only=[{topic},...], or the file is damaged" if others else CURE
+                cure = f"compute it again too, with 'only=[{topic},...]', or the file is damaged" if others else CURE
                 raise RecordingError(f"{place}: topic /{topic}, frame {value.index}", f"the field '{name}' {cause}", cure)
 
 

@@ -29,7 +29,7 @@ def parse_stamp_ns(text: str) -> int:
             return int((seconds * 1_000_000_000).to_integral_value())
     except (DecimalException, ValueError) as error:  # its exponent may be anything
         raise ValueError(f"the time stamp '{printable(text, SHOWN)}' is not a number of seconds") from error
-    raise ValueError(f"the time stamp '{printable(text, SHOWN)}' is too large for seconds")
+    raise ValueError(f"the time stamp '{printable(text, SHOWN)}' is too large for seconds: is it in nanoseconds?")
 
 
 def format_stamp(stamp_ns: int) -> str:

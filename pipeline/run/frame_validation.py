@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from trihedron.pipeline.core.errors import DataError
-from trihedron.pipeline.core.types import F32, U8, Frame
+from trihedron.pipeline.core.types import F32, U8, Camera, Frame
 from trihedron.pipeline.core.value_checks import camera_fault
 from trihedron.pipeline.run.registration_check import RegistrationCheck
 
@@ -25,6 +25,11 @@ SATURATED, CROWDED = 0.02, 3.0  # a limit: share of the image that has this valu
 AWAY_S = 0.5  # to a frame that shows surfaces at other distances
 JUDGED = 10  # readable frames after which the scale of depth is judged
 SAMPLED_PX = 8  # apart are the readings by which scale and limit are judged
+MILLIMETRES = 100.0  # metres, from which the median depth of a frame is one in millimetres
+OFF_CENTRE = 0.15  # of width or height: farther from the centre no camera has its principal point, unless images are cropped
+GAPS = 5  # between frames, whose median is judged, in periods of the camera
+UNITS = ((1e7, "nanoseconds"), (1e4, "microseconds"), (3e2, "milliseconds"))  # periods, from which stamps in this unit were taken for seconds
+TINY_GAP = 1e-7  # periods: seconds were taken for nanoseconds
 NEAR_M, FAR_M = 0.7, 8.0  # half of the readings nearer, or farther: no room of a house is seen like that (a Kinect measures 0.4 to 8 m)
 
 
@@ -39,6 +44,18 @@ def usable(frame: Frame) -> Frame | None:
     wrong = ~np.isfinite(depth) | (depth < 0.0)
     log.warning("frame %d: %d depth readings are negative or not finite; they count as missing", frame.index, np.count_nonzero(wrong))
     return replace(frame, depth_m=np.where(wrong, np.float32(0.0), depth))
+
+
+def judge_intrinsics(camera: Camera) -> None:
+    """Warn of a principal point far from the image's centre, as intrinsics of another resolution have it."""
+    x, y = 2.0 * camera.cx + 1.0, 2.0 * camera.cy + 1.0  # of images that have it in their centre
+    w, h = camera.width, camera.height
+    if max(abs(x - w) / w, abs(y - h) / h) > 2.0 * OFF_CENTRE:
+        log.warning(
+            "the principal point cx %.4g, cy %.4g is far from the centre of images of %d×%d: it is the centre of %.0f×%.0f; "
+            "give the intrinsics of these images, or ignore this where they are cropped",
+            *(camera.cx, camera.cy, w, h, x, y),
+        )
 
 
 def without_limit(frame: Frame | None, look: Callable[[float], Any]) -> Frame | None:
@@ -124,6 +141,7 @@ class FrameValidation:
         self._last_ns: int | None = None
         self._set_back_ns = 0
         self._medians_m: list[float] = []
+        self._gaps: list[float] = []
         self._frozen_depth = FrozenStream(lambda frame: frame.depth_m, color_has_changed)
         self._frozen_color = FrozenStream(lambda frame: frame.color, depth_has_changed)
         self._registration = RegistrationCheck()
@@ -189,6 +207,10 @@ class FrameValidation:
             period_ns = round(1e9 / frame.camera.fps)
             self._set_back_ns += late_ns + period_ns
             stamp_ns = self._last_ns + period_ns
+        if self._last_ns is None:
+            judge_intrinsics(frame.camera)
+        else:
+            self._judge_gap((stamp_ns - self._last_ns) / 1e9 * frame.camera.fps)
         self._last_ns = stamp_ns
         self._judge_scale(frame.depth_m)
         misregistered = self._registration(frame)
@@ -196,12 +218,28 @@ class FrameValidation:
             log.warning("depth is not registered to colour: %s; register it, or calibrate the two cameras", misregistered)
         return frame if stamp_ns == frame.stamp_ns else replace(frame, stamp_ns=stamp_ns)
 
+    def _judge_gap(self, gap: float) -> None:
+        """Warn, once, where the time between frames, in periods of the camera, shows that stamps are in another unit."""
+        if len(self._gaps) >= GAPS:
+            return
+        self._gaps.append(gap)
+        median = float(np.median(self._gaps)) if len(self._gaps) == GAPS else 1.0
+        taken = next((f"{unit} taken for seconds" for periods, unit in UNITS if median >= periods), "")
+        if taken or median <= TINY_GAP:
+            apart = "frames are %.2g periods of the camera apart: their time stamps are %s; convert them"
+            log.warning(apart, median, taken or "seconds taken for nanoseconds")
+
     def _judge_scale(self, depth_m: F32) -> None:
         """Warn, once, where the first frames are nearer or farther than a room is seen."""
         if len(self._medians_m) >= JUDGED:
             return
         sampled = depth_m[::SAMPLED_PX, ::SAMPLED_PX]
         self._medians_m += [float(np.median(sampled[sampled > 0.0]))] if (sampled > 0.0).any() else []
+        if self._medians_m and MILLIMETRES <= self._medians_m[-1] < np.inf:
+            cure = "give a depth_scale 1000 times as large, or divide float depth by 1000"
+            log.warning("the depth of frames is about %.0f m, which are millimetres taken for metres; %s", self._medians_m[-1], cure)
+            self._medians_m = [1.0] * JUDGED
+            return
         median_m = float(np.median(self._medians_m)) if len(self._medians_m) == JUDGED else 1.0
         if not NEAR_M <= median_m <= FAR_M:
             how = "small" if median_m < NEAR_M else "large"

@@ -13,7 +13,7 @@ from trihedron.pipeline.record.rerun_view import at, begin, show_times, show_val
 from trihedron.pipeline.run.accounting import FrameTimes
 
 WAITING = 8  # frames that wait for the viewer; while it is slower, further ones are not shown
-CLOSING_S = 5.0  # that closing waits for the viewer, twice
+CLOSING_S = 1.0  # that closing waits for the viewer, twice
 SPARSE_NS = 200_000_000  # between two values shown of the types that take long to show
 PERIODS_NS: dict[type[Value], int] = {
     Pose: 0,

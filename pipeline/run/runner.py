@@ -276,6 +276,6 @@ class Runner:
         index, stage = [*self.indices[failure.position : failure.position + 1], failure.position][0], failure.node
         cure = ""
         if writer is not None and writer.path is not None:
-            cure = f"repeat only that with: trihedron run replay={writer.path} only=[{stage}] dataset.frames={index}:{index + 1}"
+            cure = f"repeat only that with: trihedron run replay={writer.path} 'only=[{stage}]' dataset.frames={index}:{index + 1}"
         plugin = type(self.graph.stages[stage].plugin).__name__ if stage in self.graph.stages else "recording"
         return StageError(f"{stage} ({plugin}), frame {index}", f"{type(error).__name__}: {error}", cure)

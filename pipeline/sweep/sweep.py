@@ -193,7 +193,7 @@ class Sweeper(HydraSweeper):
         of_each = [(words_of_sequence(text), alternatives_on(text, alternatives)) for text in sequences] or [([], alternatives)]
         given = [[*sequence, *words, *alternative] for sequence, some in of_each for alternative in some]
         if not given:
-            raise UsageError("alternatives", "no sequence names any of these", "give sequences=[...] too")
+            raise UsageError("alternatives", "no sequence names any of these", "give 'sequences=[...]' too")
         return [job for one in given for job in _product(parser.parse_overrides(one))]
 
     @property

@@ -159,7 +159,7 @@ class Recording:
         """
         surface: Any = next(self.values("surface"), None)
         if not isinstance(surface, Surface):
-            raise RecordingError(str(self.path), "holds no surface", "record a run with outputs=[surface]")
+            raise RecordingError(str(self.path), "holds no surface", "record a run with 'outputs=[surface]'")
         return surface
 
     @cached_property

@@ -51,7 +51,8 @@ TUM: list[tuple[Change, str]] = [
     (replace("depth.txt", "10.105 ", "noon "),
      "{}/depth.txt:3: the time stamp 'noon' is not a number of seconds; each line holds 'stamp file'; correct or remove this one"),
     (replace("depth.txt", "10.105 ", "1403636579763555584 "),
-     "{}/depth.txt:3: the time stamp '1403636579763555584' is too large for seconds; each line holds 'stamp file'; correct or remove this one"),
+     "{}/depth.txt:3: the time stamp '1403636579763555584' is too large for seconds: is it in nanoseconds?; "
+     "each line holds 'stamp file'; correct or remove this one"),
     (replace("rgb.txt", "10.100000 rgb/10.100000.png", "10.100000"),
      "{}/rgb.txt:3: has 1 column instead of 2; each line holds 'stamp file'; correct or remove this one"),
     (lambda f: (f / "rgb.txt").write_text("# nothing\n"), "{}/rgb.txt: lists no images; give a list with a line 'stamp file' for each image"),

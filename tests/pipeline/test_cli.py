@@ -39,6 +39,7 @@ def refused(capsys, *words, code=1):
     return lines[0]
 
 
+PATHS = "give a folder, a .mcap or .bag file, or key=value (quote lists: 'only=[pose]')"
 SEE = "see trihedron plugins"
 MISTAKES = [
     (["threads=abc"], 1, "trihedron: threads: Value 'abc' of type 'str' could not be converted to Integer; give a value of that type"),
@@ -67,7 +68,7 @@ MISTAKES = [
     ),
     (["+graph.planes.foo=dataset"], 1, "trihedron: graph.planes.foo: the slot 'planes' has no input 'foo'; known: frame, normals"),
     (["outputs=[trajektory]"], 1, "trihedron: outputs: no stage writes 'trajektory'; did you mean 'trajectory'?"),
-    (["outputs=[]"], 1, "trihedron: outputs: is empty, so nothing would run; give outputs=[trajectory]"),
+    (["outputs=[]"], 1, "trihedron: outputs: is empty, so nothing would run; give 'outputs=[trajectory]'"),
     (["dataset.frames=9:3"], 1, f"trihedron: dataset.frames: '9:3' is not a range of frames A:B with A < B; {SEE} dataset synthetic"),
     (["dataset=tums"], 1, "trihedron: dataset: there is no plugin 'tums' for the slot 'dataset'; did you mean 'tum'?"),
     (["only=[pose]"], 1, "trihedron: only: chooses stages of a replay, and there is none; give replay=FILE.mcap too"),
@@ -75,7 +76,7 @@ MISTAKES = [
     (["record.topics=[normal]"], 1, "trihedron: record.topics: no stage writes 'normal'; did you mean 'normals'?"),
     (["feedback=old"], 1, "trihedron: feedback: Invalid value 'old', expected one of [new, recorded]; give a value of that type"),
     (["out=/proc/no"], 1, "trihedron: out: the folder cannot be made: No such file or directory: /proc/no; give another out=FOLDER"),
-    (["pose"], 2, "trihedron: pose: is not an override; write key=value, for example threads=1 (quote lists: 'only=[pose]')"),
+    (["/no/pose"], 2, f"trihedron: /no/pose: is not key=value, and there is no such path; {PATHS}"),
     (["-x"], 2, "trihedron: -x: is not an option of run; known: -m, --multirun, --dry-run; everything else is key=value"),
 ]  # fmt: skip
 
@@ -106,8 +107,11 @@ def test_unknown_command_and_help(capsys):
     assert main(["run", "--help"]) == 0
     text = " ".join(capsys.readouterr().out.split())
     graphs = {file.stem for file in (Path(__file__).parents[2] / "conf" / "graph").glob("*.yaml")}
-    listed = text.partition("graph=NAME ")[2].partition(" STAGE=")[0].replace(" (default)", "").split(", ")
-    assert set(listed) == graphs and "synthetic (default), " in text and ", tum " in text and "replay=FILE.mcap" in text
+    listed = text.partition("graph=NAME ")[2].partition(" without=")[0].replace(" (default)", "").split(", ")
+    assert set(listed) == graphs and "synthetic (default), " in text and ", tum " in text and "replay=FILE.mcap 'only=[STAGE]'" in text
+    for group, word in (("without", "without=PART"), ("experiment", "experiment=NAME (with -m)")):
+        names = sorted(file.stem for file in (Path(__file__).parents[2] / "conf" / group).glob("*.yaml"))
+        assert f"{word} {', '.join(names)} " in text
     assert main(["--version"]) == 0 and capsys.readouterr().out.strip() == f"trihedron {version('trihedron')}"
 
 

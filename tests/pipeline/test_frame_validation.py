@@ -98,3 +98,38 @@ def test_a_camera_that_cannot_be_recorded_is_refused_at_the_first_frame():
     with pytest.raises(DataError) as error:
         FrameValidation({}, 1)(0, lambda position: frame, lambda: 0)
     assert str(error.value) == "camera of frame 0: fps is not within 1e-06 … 1e+06; check the calibration of the data set"
+
+
+def test_millimetres_taken_for_metres_are_named_at_once(caplog):
+    rng = np.random.default_rng(0)
+    warnings = validated([frame(k, rng.uniform(1499.6, 1500.4, (120, 160)).astype(np.float32)) for k in range(12)], caplog)[1]
+    cure = "give a depth_scale 1000 times as large, or divide float depth by 1000"
+    assert warnings == [f"the depth of frames is about 1500 m, which are millimetres taken for metres; {cure}"]
+
+
+@pytest.mark.parametrize(
+    "period_ms, said",
+    [
+        (1e11 / 3, "1e+09 periods of the camera apart: their time stamps are nanoseconds taken for seconds"),
+        (1e8 / 3, "1e+06 periods of the camera apart: their time stamps are microseconds taken for seconds"),
+        (1e5 / 3, "1e+03 periods of the camera apart: their time stamps are milliseconds taken for seconds"),
+        (1e-6, "3e-08 periods of the camera apart: their time stamps are seconds taken for nanoseconds"),
+        (33, None),
+        (2000, None),  # one frame every two seconds
+    ],
+)
+def test_time_stamps_in_another_unit_are_named(period_ms, said, caplog):
+    frames = [replace(frame(k), stamp_ns=round(k * period_ms * 1e6)) for k in range(9)]
+    frames[4:] = [replace(f, stamp_ns=f.stamp_ns + 10**11) for f in frames[4:]] if said is None else frames[4:]  # a pause
+    assert validated(frames, caplog)[1] == ([f"frames are {said}; convert them"] if said else [])
+
+
+@pytest.mark.parametrize(
+    "cx, cy, centre_of", [(159.5, 119.5, "320×240"), (39.5, 29.5, "80×60"), (79.5, 29.5, "160×60"), (79.5, 59.5, None), (90.0, 50.0, None)]
+)
+def test_intrinsics_of_another_resolution_are_named(cx, cy, centre_of, caplog):
+    camera = replace(CAMERA, cx=cx, cy=cy)
+    found = validated([replace(frame(k), camera=camera) for k in range(3)], caplog)[1]
+    cure = "give the intrinsics of these images, or ignore this where they are cropped"
+    place = f"the principal point cx {cx:.4g}, cy {cy:.4g} is far from the centre of images of 160×120"
+    assert found == ([f"{place}: it is the centre of {centre_of}; {cure}"] if centre_of else [])

@@ -180,7 +180,7 @@ def test_unknown_output():
 
 
 def test_empty_outputs():
-    assert message(outputs=[]) == "outputs: is empty, so nothing would run; give outputs=[trajectory]"
+    assert message(outputs=[]) == "outputs: is empty, so nothing would run; give 'outputs=[trajectory]'"
 
 
 def test_trajectory_needs_a_pose():

@@ -150,7 +150,7 @@ def test_a_failing_stage_names_itself_and_keeps_the_rest(tmp_path):
         record(tmp_path / "a.mcap", toy_graph(rotation=ToyRotation(fails_at=6)))
     assert str(error.value) == (
         "rotation (ToyRotation), frame 6: ValueError: matrix is singular; "
-        f"repeat only that with: trihedron run replay={tmp_path}/a.mcap only=[rotation] dataset.frames=6:7"
+        f"repeat only that with: trihedron run replay={tmp_path}/a.mcap 'only=[rotation]' dataset.frames=6:7"
     )
     recording = Recording(tmp_path / "a.mcap")
     assert [v.index for v in recording.values("pose")] == [0, 1, 2, 3, 5]

@@ -92,6 +92,17 @@ def test_what_cannot_be_exported_is_one_line(run, tmp_path, monkeypatch, capsys)
     assert capsys.readouterr().err == "trihedron: pycolmap: is not installed; install it with: pip install pycolmap\n"
 
 
+def test_formats_are_known_by_the_endings_of_their_files(run, tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    assert main(["export", str(run), "--to", "rrd"]) == 1
+    assert capsys.readouterr().err.startswith("trihedron: rerun-sdk: is not installed")
+    errors = []
+    for name in ("glb", "gltf"):
+        assert main(["export", str(run), "--to", name, "--out", str(tmp_path / "a.glb")]) == 1
+        errors.append(capsys.readouterr().err)
+    assert errors[0] == errors[1] and "surface" in errors[0]  # this run has none
+
+
 class ClosedWindow:
     """A stream to a window that was closed: it takes everything, and cannot hand it over."""
 

@@ -107,7 +107,7 @@ def test_a_file_that_is_still_being_written(tmp_path, capsys):
     assert main(["export", str(path), "--to", "csv"]) == 1
     assert capsys.readouterr().err.splitlines() == [
         f"trihedron: {path} is still being written; its first 9 messages are read",
-        f"trihedron: {path}: holds no poses; record a run with outputs=[trajectory]",
+        f"trihedron: {path}: holds no poses; record a run with 'outputs=[trajectory]'",
     ]
     writer.close()
     assert th.Recording(path).frames == (0, 1, 2) and capsys.readouterr().err == ""

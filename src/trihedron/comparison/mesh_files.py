@@ -20,7 +20,7 @@ CURE = "give a .ply or .obj file"
 def read_mesh(path: Path) -> tuple[F64, I32]:
     """Vertices (v, 3) and triangles (t, 3) of a PLY or OBJ file; polygons become triangles. Raises DataError, LibraryError."""
     if not path.exists():
-        raise DataError(str(path), "there is no such file", "run with outputs=[trajectory,surface] first")
+        raise DataError(str(path), "there is no such file", "run with 'outputs=[trajectory,surface]' first")
     kind = path.suffix.lower().removeprefix(".")
     if kind not in ("ply", "obj"):
         raise DataError(str(path), f"'{path.suffix}' is not a mesh file this program reads", CURE)

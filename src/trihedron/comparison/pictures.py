@@ -28,7 +28,7 @@ def draw(path: str, frame: int, out: Path) -> None:
     recording = open_recording(Path(path))
     poses = list(recording.values("pose"))
     if not poses:
-        raise RecordingError(path, "holds no poses", "record a run with outputs=[trajectory]")
+        raise RecordingError(path, "holds no poses", "record a run with 'outputs=[trajectory]'")
     numbers = [pose.index for pose in poses]
     frame = numbers[len(numbers) // 2] if frame < 0 else frame
     if frame not in numbers:
