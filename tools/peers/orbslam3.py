@@ -60,7 +60,7 @@ def track(job: dict[str, Any]) -> None:
         due, last = due + min(stamp_s - last, LONGEST_PAUSE_S), stamp_s
         time.sleep(max(due - time.perf_counter(), 0.0))
         read = time.thread_time()
-        with np.load(file) as arrays:
+        with np.load(file, allow_pickle=False) as arrays:
             color, depth_m = arrays["color"], arrays["depth_m"]
         reading_s += time.thread_time() - read
         began = time.perf_counter()
