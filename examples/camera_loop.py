@@ -1,39 +1,114 @@
-"""Track a camera frame by frame, and save what was found.
+"""Track a camera, and save the surface and the floor plan of what it saw.
 
-python examples/camera_loop.py [FOLDER]    # a folder of images as of `dataset=folder`; without one the built-in room
+python examples/camera_loop.py                      # the built-in room
+python examples/camera_loop.py my_recording         # a folder with rgb/, depth/ and camera.yaml, as of `dataset=folder`
+python examples/camera_loop.py realsense            # Intel RealSense: pip install 'trihedron[realsense]'
+python examples/camera_loop.py oak                  # Luxonis OAK-D: pip install 'depthai>=3'
+
+Ctrl-C ends a camera. The run folder is runs/camera. Words after the source are those of the command line, as view=foxglove.
 """
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
-from typing import Any
+from contextlib import AbstractContextManager, contextmanager, suppress
+from typing import Any, TypeAlias
+
+import numpy as np
 
 import trihedron as th
 
-
-def frames(dataset: Any) -> Iterator[tuple[Any, Any, float]]:
-    """Stand in for your camera: RGB, depth in metres, seconds."""
-    for i in range(len(dataset)):
-        if (frame := dataset(i)) is not None:
-            yield frame.color, frame.depth_m, frame.stamp_ns / 1e9
+WIDTH, HEIGHT, FPS = 640, 480, 30
+OAK_HEIGHT = 400  # with WIDTH, a size that all cameras of an OAK-D have
+Images: TypeAlias = Iterator[tuple[Any, Any, float]]  # RGB, registered depth, seconds
+Source: TypeAlias = AbstractContextManager[tuple[Any, Images]]  # the camera, and its images for as long as it sends them
 
 
-def main(folder: str = "", out: str = ".", length: int = 60, width: int = 640, height: int = 480) -> None:
-    dataset = th.dataset.folder(path=folder) if folder else th.dataset.synthetic(length=length, width=width, height=height)
-    with th.Slam(dataset(0).camera, outputs=["trajectory", "surface"]) as slam:
-        for rgb, depth, t in frames(dataset):
+@contextmanager
+def replay(dataset: Any) -> Iterator[tuple[Any, Images]]:
+    """A data set in the place of a camera: depth in metres."""
+    frames = (frame for frame in map(dataset, range(len(dataset))) if frame is not None)
+    yield dataset(0).camera, ((frame.color, frame.depth_m, frame.stamp_ns / 1e9) for frame in frames)
+
+
+@contextmanager
+def realsense() -> Iterator[tuple[Any, Images]]:
+    """A RealSense; the maker's library registers depth to colour."""
+    import pyrealsense2 as rs
+
+    config, pipeline, align = rs.config(), rs.pipeline(), rs.align(rs.stream.color)
+    config.enable_stream(rs.stream.color, WIDTH, HEIGHT, rs.format.rgb8, FPS)
+    config.enable_stream(rs.stream.depth, WIDTH, HEIGHT, rs.format.z16, FPS)
+    profile = pipeline.start(config)
+    lens = profile.get_stream(rs.stream.color).as_video_stream_profile().get_intrinsics()
+    scale = 1.0 / profile.get_device().first_depth_sensor().get_depth_scale()
+    distortion = tuple(lens.coeffs) if any(lens.coeffs) else ()
+    camera = th.Camera(lens.width, lens.height, lens.fx, lens.fy, lens.ppx, lens.ppy, float(FPS), depth_scale=scale, distortion=distortion)
+
+    def images() -> Images:
+        while True:
+            pair = align.process(pipeline.wait_for_frames())
+            color, depth = pair.get_color_frame(), pair.get_depth_frame()
+            if color and depth:
+                yield np.asarray(color.get_data()), np.asarray(depth.get_data()), color.get_timestamp() / 1e3
+
+    try:
+        yield camera, images()
+    finally:
+        pipeline.stop()
+
+
+@contextmanager
+def oak() -> Iterator[tuple[Any, Images]]:
+    """An OAK-D; the device undistorts colour and registers its stereo depth (mm) to it."""
+    import depthai as dai
+
+    with dai.Pipeline() as pipeline:
+        node = pipeline.create(dai.node.RGBD).build(True, size=(WIDTH, OAK_HEIGHT), fps=float(FPS))
+        queue = node.rgbd.createOutputQueue(maxSize=1, blocking=False)  # the newest pair
+        pipeline.start()
+        (fx, _, cx), (_, fy, cy), _ = queue.get().getRGBFrame().getTransformation().getIntrinsicMatrix()
+
+        def images() -> Images:
+            while pipeline.isRunning():
+                pair = queue.get()
+                color, depth = pair.getRGBFrame(), pair.getDepthFrame()
+                yield color.getCvFrame()[:, :, ::-1], depth.getFrame(), color.getTimestamp().total_seconds()  # OpenCV has blue first
+
+        yield th.Camera(WIDTH, OAK_HEIGHT, fx, fy, cx, cy, float(FPS), depth_scale=1000), images()
+
+
+def show(slam: Any, images: Images) -> int:
+    """Track images until they or Ctrl-C end, print where the status changes, and return how many there were."""
+    status, count, begin = "", 0, None
+    with suppress(KeyboardInterrupt):
+        for rgb, depth, t in images:
             pose = slam.track(rgb, depth, t)
-            if pose.index % 10 == 0:
-                x, y, z = pose.T_world_camera[:3, 3]
-                planes = slam.values["planes"]
-                print(f"{t:8.3f} s  {pose.status:8}  x {x:6.3f}  y {y:6.3f}  z {z:6.3f} m  {len(planes.pixels)} planes")
-        mesh = slam.mesh()
-        print(f"{len(slam.map.points)} points and {len(slam.map.planes)} planes in the map, {len(mesh.triangles)} triangles")
-        slam.trajectory.to_tum(f"{out}/trajectory.txt")
-        slam.save_map(f"{out}/room_map.mcap")
-        slam.save(f"{out}/run.mcap")
+            count, begin = count + 1, t if begin is None else begin
+            if pose.status != status:
+                status = pose.status
+                print(f"{t - begin:6.1f} s  {status}{': ' if pose.reason else ''}{pose.reason}")
+    return count
+
+
+def track(source: Source, out: str, *words: str) -> None:
+    """Track the images of a source, and write the run folder `out`."""
+    with source as (camera, images), th.Slam(camera, *words, out=out, outputs=["trajectory", "surface", "building"]) as slam:
+        count = show(slam, images)
+    print(f"{count} frames, {len(slam.mesh().triangles)} triangles, {len(slam.building().rooms)} rooms")
+    print(f"surface {out}/surface.ply, floor plan {out}/floorplan.svg")
+
+
+def main(source: str = "room", *words: str, out: str = "runs/camera") -> None:
+    if source in ("realsense", "oak"):
+        track(realsense() if source == "realsense" else oak(), out, *words)
+    else:
+        track(replay(th.dataset.synthetic(length=60) if source == "room" else th.dataset.folder(path=source)), out, *words)
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    try:
+        main(*sys.argv[1:])
+    except (th.TrihedronError, ImportError) as error:
+        sys.exit(f"camera_loop: {error}")

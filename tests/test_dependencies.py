@@ -27,6 +27,7 @@ UNDECLARED = {  # module -> why no dependency or extra declares it
     "pandas": "trihedron.compare returns a DataFrame where it is installed",
     "geometry_msgs": "ROS 2, from the Debian packages of a distribution of ROS",
     "message_filters": "ROS 2",
+    "depthai": "a camera of an example, of the user's own installation",
     "rclpy": "ROS 2",
     "sensor_msgs": "ROS 2",
     "tf2_ros": "ROS 2",

@@ -1,17 +1,20 @@
 """The examples run as they stand: each is loaded from its file."""
 
 import importlib.util
+import runpy
 import struct
+import subprocess
 import sys
+from datetime import timedelta
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 
 import trihedron as th
 from trihedron.datasets.simulation.synthetic import Synthetic
-from trihedron.pipeline.record.trajectories import read_trajectory
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
@@ -23,19 +26,48 @@ def example(name: str) -> ModuleType:
     return module
 
 
+def run_example(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Run an example as a program, without words."""
+    monkeypatch.setattr(sys, "argv", [f"{name}.py"])
+    monkeypatch.setattr(sys, "path", [str(EXAMPLES), *sys.path])
+    runpy.run_path(str(EXAMPLES / f"{name}.py"), run_name="__main__")
+
+
 def test_every_example_is_tested():
     tested = Path(__file__).read_text() + (Path(__file__).parent / "test_gallery.py").read_text()
     for file in EXAMPLES.glob("*.*"):
         assert file.stem in tested, file
 
 
-def test_camera_loop(tmp_path, capsys):
-    example("camera_loop").main(out=str(tmp_path), length=12, width=160, height=120)
-    assert len(read_trajectory(tmp_path / "trajectory.txt")) == 12
-    assert len(th.Recording(tmp_path / "run.mcap").poses) == 12
-    assert (tmp_path / "room_map.mcap").stat().st_size > 1000
-    printed = capsys.readouterr().out.splitlines()
-    assert len(printed) == 3 and "ok" in printed[1] and "triangles" in printed[2]
+def room_folder(folder: Path, length: int = 12) -> Path:
+    """The built-in room as rgb/, depth/ and camera.yaml."""
+    room = Synthetic(length=length, width=160, height=120)
+    for name in ("rgb", "depth"):
+        (folder / name).mkdir(parents=True)
+    for i in range(length):
+        frame = room(i)
+        cv2.imwrite(str(folder / "rgb" / f"{i:06d}.png"), frame.color[:, :, ::-1])
+        cv2.imwrite(str(folder / "depth" / f"{i:06d}.png"), np.rint(5000 * frame.depth_m).astype(np.uint16))
+    c = room(0).camera
+    (folder / "camera.yaml").write_text(f"width: 160\nheight: 120\nfx: {c.fx}\nfy: {c.fy}\ncx: {c.cx}\ncy: {c.cy}\ndepth_scale: 5000\n")
+    return folder
+
+
+def test_camera_loop_over_a_folder(tmp_path, capsys):
+    out = tmp_path / "out"
+    example("camera_loop").main(str(room_folder(tmp_path / "mine")), "threads=1", out=str(out))
+    first, counts, files = capsys.readouterr().out.splitlines()
+    assert first == "   0.0 s  ok: first frame, origin of the world"
+    assert counts.startswith("12 frames, ") and int(counts.split()[2]) > 100 and counts.endswith(" rooms")
+    assert files == f"surface {out}/surface.ply, floor plan {out}/floorplan.svg"
+    assert (out / "surface.ply").stat().st_size > 1000 and (out / "floorplan.svg").read_text().startswith("<svg")
+    assert [pose.status for pose in th.Recording(out).poses] == ["ok"] * 12
+
+
+def test_camera_loop_names_what_is_wrong(tmp_path):
+    words = [sys.executable, str(EXAMPLES / "camera_loop.py"), str(tmp_path / "nowhere")]
+    done = subprocess.run(words, capture_output=True, text=True)
+    assert done.returncode == 1 and done.stderr == f"camera_loop: {tmp_path}/nowhere: does not exist; give an existing folder as dataset.path\n"
 
 
 FAR = Path(__file__).resolve().parents[2] / "shared" / "data" / "tum_fr3_structure_notexture_far"
@@ -114,14 +146,68 @@ class Camera:
         self.stopped = True
 
 
-@pytest.mark.slow
-def test_realsense_loop(tmp_path, monkeypatch, capsys):
+def test_camera_loop_with_a_realsense(tmp_path, monkeypatch, capsys):
     camera = Camera()
     monkeypatch.setitem(sys.modules, "pyrealsense2", camera)
-    example("realsense_loop").main(str(tmp_path), "outputs=[trajectory]")
+    monkeypatch.chdir(tmp_path)
+    run_example("realsense_loop", monkeypatch)
     assert camera.stopped
-    assert capsys.readouterr().out.endswith(f"the recording is in {tmp_path}\n")
-    assert [pose.status for pose in th.Recording(tmp_path).poses] == ["ok"] * 6
+    assert capsys.readouterr().out.splitlines()[1].startswith("6 frames, ")
+    assert [pose.status for pose in th.Recording("runs/camera").poses] == ["ok"] * 6
+
+
+class Oak:
+    """A module in the place of depthai 3: the built-in room in mm, one pair unused before the first, until Ctrl-C after 6 frames."""
+
+    room, node, count, open = Synthetic(width=640, height=400), SimpleNamespace(RGBD="RGBD"), -1, False
+
+    def Pipeline(self):
+        return self
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *error):
+        self.open = False
+
+    def create(self, kind):
+        assert kind == "RGBD"
+        return self
+
+    def build(self, autocreate, size, fps):
+        assert autocreate and size == (640, 400) and fps == 30.0
+        return SimpleNamespace(rgbd=SimpleNamespace(createOutputQueue=lambda maxSize, blocking: SimpleNamespace(get=self.pair)))
+
+    def start(self):
+        self.open = True
+
+    def isRunning(self):
+        return self.open
+
+    def pair(self):
+        frame, self.count = self.room(max(self.count, 0)), self.count + 1
+        if self.count > 6:
+            raise KeyboardInterrupt
+        color = SimpleNamespace(
+            getCvFrame=lambda: frame.color[:, :, ::-1],
+            getTimestamp=lambda: timedelta(microseconds=frame.stamp_ns / 1e3),
+            getTransformation=lambda: SimpleNamespace(getIntrinsicMatrix=lambda: frame.camera.K.tolist()),
+        )
+        depth = SimpleNamespace(getFrame=lambda: np.rint(frame.depth_m * 1000).astype(np.uint16))
+        return SimpleNamespace(getRGBFrame=lambda: color, getDepthFrame=lambda: depth)
+
+
+def test_camera_loop_with_an_oak(tmp_path, monkeypatch, capsys):
+    camera = Oak()
+    monkeypatch.setitem(sys.modules, "depthai", camera)
+    monkeypatch.chdir(tmp_path)
+    run_example("oak_loop", monkeypatch)
+    assert not camera.open
+    assert capsys.readouterr().out.splitlines()[1].startswith("6 frames, ")
+    poses, truth = th.Recording("runs/camera").poses, Oak.room.truth().poses
+    assert [pose.status for pose in poses] == ["ok"] * 6
+    moved = np.linalg.inv(truth[0]) @ truth[5]
+    np.testing.assert_allclose(poses[5].T_world_camera[:3, 3], moved[:3, 3], atol=0.002)  # of 37 mm
 
 
 def message(encoding, dtype, rows, big=False, pad=0):

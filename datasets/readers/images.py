@@ -25,13 +25,29 @@ TAIL = 64  # bytes searched for the end mark: writers may pad
 
 def read_color(path: Path) -> U8:
     """(h, w, 3) RGB. Raises UnreadableImage for a missing or damaged file, DataError for an image that is not 8-bit colour."""
+    return _rgb(_decode(path), str(path))
+
+
+def color_of(data: bytes, place: str) -> U8:
+    """`read_color` of the bytes of a file."""
+    return _rgb(decode_image(data), place)
+
+
+def read_levels(path: Path) -> U8:
+    """(h, w) whole numbers of an 8-bit image with one channel. Raises UnreadableImage for a missing or damaged file, DataError for another image."""
     image = _decode(path)
+    if image.ndim != 2 or image.dtype != np.uint8:
+        raise DataError(str(path), "is not an 8-bit image with one channel", "give it as the camera wrote it")
+    return np.asarray(image, dtype=np.uint8)
+
+
+def _rgb(image: NDArray[Any], place: str) -> U8:
     if image.dtype != np.uint8:
         cause = f"has {8 * image.itemsize} bits a channel where colour has 8"
-        raise DataError(str(path), cause, "give 8-bit RGB images; are colour and depth swapped?")
+        raise DataError(place, cause, "give 8-bit RGB images; are colour and depth swapped?")
     if image.ndim != 3 or image.shape[2] not in (3, 4):
         channels = 1 if image.ndim == 2 else image.shape[2]
-        raise DataError(str(path), f"has {channels} channel{'s' * (channels != 1)} where colour has 3", "convert it to an RGB image")
+        raise DataError(place, f"has {channels} channel{'s' * (channels != 1)} where colour has 3", "convert it to an RGB image")
     return np.asarray(image if image.shape[2] == 3 else cv2.cvtColor(image, cv2.COLOR_RGBA2RGB), dtype=np.uint8)
 
 

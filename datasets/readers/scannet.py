@@ -10,10 +10,9 @@ import cv2
 import numpy as np
 
 from trihedron.datasets.readers.cameras import Calibration
-from trihedron.datasets.readers.images import read_color, read_depth
+from trihedron.datasets.readers.images import read_color
 from trihedron.datasets.readers.matrices import files_by_number, frame_stamps, pose_files, read_matrix
-from trihedron.datasets.readers.picture_headers import UnreadableImage
-from trihedron.datasets.readers.sequence import ImageSequence, SequenceReader
+from trihedron.datasets.readers.sequence import ImageSequence, SequenceReader, first_size
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, U8, Camera
@@ -37,7 +36,7 @@ class ScanNet(SequenceReader):
         if not numbers:
             raise DataError(str(folder), "holds no frames of ScanNet", LAYOUT)
         color_K, depth_K = (_intrinsics(folder / "intrinsic" / f"intrinsic_{kind}.txt") for kind in ("color", "depth"))
-        height, width = _first_size(list(depths.values()))
+        height, width = first_size(list(depths.values()), DEPTH_SCALE)
         camera = Camera(width, height, float(depth_K[0, 0]), float(depth_K[1, 1]), float(depth_K[0, 2]), float(depth_K[1, 2]))
         stamps = frame_stamps(numbers, camera.fps)
         truth = pose_files(stamps, [folder / "pose" / f"{n}.txt" for n in numbers])
@@ -53,17 +52,6 @@ def _intrinsics(path: Path) -> F64:
     if not np.isfinite(K).all() or K[0, 0] <= 0 or K[1, 1] <= 0:
         raise DataError(str(path), "holds no focal length", "give the intrinsics as the data set has them")
     return K[:3, :3]
-
-
-def _first_size(files: list[Path]) -> tuple[int, int]:
-    """Height and width of the first depth image that can be read."""
-    for file in files:
-        try:
-            shape = read_depth(file, DEPTH_SCALE).shape
-            return shape[0], shape[1]
-        except UnreadableImage:
-            continue
-    raise DataError(str(files[0].parent), "holds no depth image that can be read", "export the scan again")
 
 
 def _read_reduced(path: Path, K: F64, camera: Camera) -> U8:

@@ -92,9 +92,13 @@ class SequenceReader(ABC):
     def _open(self, folder: Path) -> ImageSequence:
         """List the whole sequence. Raises DataError when the folder cannot be used."""
 
+    def _place(self) -> Path:
+        """The folder. Raises DataError when it cannot be one."""
+        return open_folder(self.path)
+
     @cached_property
     def _sequence(self) -> ImageSequence:
-        folder = open_folder(self.path)
+        folder = self._place()
         with one_line_errors(str(folder), CURE):
             return select_frames(self._open(folder), self.frames, str(folder))
 
@@ -133,6 +137,17 @@ def open_folder(path: str) -> Path:
     if empty:
         raise DataError(str(folder), "is empty", "give the folder that holds the images as dataset.path")
     return folder
+
+
+def first_size(files: list[Path], depth_scale: float) -> tuple[int, int]:
+    """Height and width of the first depth image that can be read. Raises DataError when none can."""
+    for file in files:
+        try:
+            shape = read_depth(file, depth_scale).shape
+            return shape[0], shape[1]
+        except UnreadableImage:
+            continue
+    raise DataError(str(files[0].parent), "holds no depth image that can be read", "export the scan again")
 
 
 def select_frames(sequence: ImageSequence, frames: str, place: str) -> ImageSequence:

@@ -8,6 +8,7 @@ from trihedron.pipeline.core.errors import DataError
 
 RECORDING = ".mcap"
 BAG = ".bag"  # of a ROS 1 bag
+FILES = {RECORDING: "mcap", BAG: "mcap", ".r3d": "record3d"}  # ending of a file -> data set plugin
 METADATA_FILE = "metadata.yaml"  # of a rosbag2 folder
 LAYOUTS = {  # data set plugin -> patterns: of each group one must be there
     "mcap": ((METADATA_FILE,),),
@@ -15,14 +16,15 @@ LAYOUTS = {  # data set plugin -> patterns: of each group one must be there
     "icl_nuim": (("associations.txt", "*.freiburg", "scene_*.depth"),),
     "seven_scenes": (("frame-*.color.*",),),
     "replica": (("traj.txt",), ("results/",)),
+    "stray_scanner": (("odometry.csv",), ("rgb.mp4",)),
     "scannet": (("intrinsic/intrinsic_depth.txt",),),
 }
 
 
 def layout_of(source: Path) -> str:
-    """Return the data set plugin whose layout a folder has, `mcap` for a recording or bag, `folder` for any other folder. Raises DataError."""
-    if source.is_file() and source.suffix in (RECORDING, BAG):
-        return "mcap"
+    """Return the data set plugin whose layout a folder has, by its ending that of a file, `folder` for any other folder. Raises DataError."""
+    if source.is_file() and source.suffix in FILES:
+        return FILES[source.suffix]
     if not source.is_dir():
         cause = "is not a folder or a recording" if source.exists() else "does not exist"
         raise DataError(str(source), cause, f"give the folder of a data set or a {RECORDING} file")
