@@ -31,6 +31,12 @@ def test_the_plugins_import_no_library_that_few_of_them_use():
     assert not heavy & imported
 
 
+def test_windows_is_refused_in_words():
+    program = "import sys; sys.platform = 'win32'; import trihedron"
+    said = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True).stderr.splitlines()[-1]
+    assert said == "ImportError: trihedron does not run on Windows itself; install it in WSL 2, see docs/how-to/macos-and-windows.md"
+
+
 @pytest.mark.slow
 def test_kernels_survive_in_the_users_cache_when_the_package_is_read_only(tmp_path):
     """A file in the place of every __pycache__ folder: nothing can be kept beside the sources, whoever asks."""

@@ -134,8 +134,8 @@ class Scheduler:
             self._ready[self._lanes[task[0]]].push(task, self._order.key(task))
 
     def _work(self, lane: Lane) -> None:
-        if lane is Lane.lagging:
-            with contextlib.suppress(OSError, AttributeError):  # Linux has a priority for each thread
+        if lane is Lane.lagging and sys.platform == "linux":  # which has a priority for each thread
+            with contextlib.suppress(OSError):
                 os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICE)
         while True:
             with self._lock:

@@ -17,7 +17,11 @@ nothing of the process.
 from __future__ import annotations
 
 import importlib
+import sys
 from typing import TYPE_CHECKING, Any
+
+if sys.platform == "win32":
+    raise ImportError("trihedron does not run on Windows itself; install it in WSL 2, see docs/how-to/macos-and-windows.md")
 
 if TYPE_CHECKING:
     from trihedron.ablations import ablate
