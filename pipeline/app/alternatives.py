@@ -109,7 +109,7 @@ class Alternatives:
 
     def run(self, folders: Sequence[Path], on_frame: Frames) -> None:
         """Compute all frames; each alternative's files go to its folder, the values of all to `on_frame(index, values)`. Raises TrihedronError."""
-        compile_once(sorted({name for runner in self.runners for name in runner.computed}), False)
+        compile_once(sorted({name for runner in self.runners for name in runner.computed}), max(runner.count for runner in self.runners))
         with Warnings() as warnings, compilation_reported():
             self._warm_up()
             warnings.muted = False

@@ -42,6 +42,7 @@ AGAIN = ("replay={folder}/0/run.mcap", "only=[surface]", "outputs=[trajectory,su
 WHEEL = ((DIRECTIONS, SURFACE), (ROOM, AGAIN, BUILDING, LIVE, POINTS, FOUND, UNKNOWN, TURN))  # and for a wheel: also buildings and replays
 PARTS = {"tracking": TRACKING, "all": ALL, "wheel": WHEEL}
 FUNCTIONS = {"tracking": 550, "all": 910, "wheel": 1130}  # compiled by both processes, about
+SHORT = 150  # frames of a run that hardly closes a loop
 STAGES = {"keypoints", "lines", "planes", "manhattan"}  # of the graphs that these runs compile most of
 SWITCH = "TRIHEDRON_COMPILE"  # environment variable: with 0 a run compiles what it calls and nothing beforehand
 _ONCE = threading.Lock()  # runs that begin in several threads at once compile once
@@ -85,11 +86,11 @@ def _compile(what: str, **variables: str) -> float:
     return time.perf_counter() - began
 
 
-def compile_once(stages: Sequence[str], live: bool) -> None:
+def compile_once(stages: Sequence[str], frames: int | None) -> None:
     """Fill the cache before a run of these stages, unless that was done for these versions and this processor, or a wheel brought the machine code.
-    For a live run with all that it may come to need. A graph of other stages compiles what it calls as it runs, and so does any run where the
-    variable TRIHEDRON_COMPILE is 0."""
-    what = "all" if live else "tracking"
+    For a run of more than SHORT `frames`, or a live one (None), with all that it may come to need: no frame waits for the compiler when a loop is
+    closed. A graph of other stages compiles what it calls as it runs, and so does any run where the variable TRIHEDRON_COMPILE is 0."""
+    what = "all" if frames is None or frames > SHORT else "tracking"
     if archive() is not None:
         return
     with _ONCE:

@@ -80,7 +80,7 @@ def _execute(config: DictConfig, out: Path, overrides: list[str], began: float, 
     topics = recorded_topics(config, graph, replay)
     _announce(runner)
     trial = partial(Runner, graph, config.seed, config.threads, replay, frames, remembered)
-    compile_once(runner.computed, runner.feed is not None)
+    compile_once(runner.computed, runner.count if runner.feed is None else None)
     with lock_folder(out):
         write_configuration(out, config, overrides)
         with Warnings() as warnings, compilation_reported():

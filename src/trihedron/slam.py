@@ -147,7 +147,7 @@ class Slam:
             self._stack.enter_context(lock_folder(self._out))
             self._config.out = str(self._out)
             write_configuration(self._out, self._config, self._words)
-        compile_once(self._runner.computed, True)
+        compile_once(self._runner.computed, None)
         with compilation_reported():
             warm_up(Runner(_on_synthetic_images(graph, self.camera), self._config.seed, self._config.threads))
         if self._out is not None or viewer.server is not None:

@@ -140,19 +140,20 @@ def compiled(tmp_path, monkeypatch):
 
 
 def test_a_run_compiles_beforehand_what_its_kind_needs(compiled):
-    compilation.compile_once(["dataset", *compilation.STAGES], live=False)
-    compilation.compile_once(["dataset", *compilation.STAGES], live=True)
-    assert compiled == ["tracking", "all"]
+    compilation.compile_once(["dataset", *compilation.STAGES], frames=60)
+    compilation.compile_once(["dataset", *compilation.STAGES], frames=500)
+    compilation.compile_once(["dataset", *compilation.STAGES], frames=None)
+    assert compiled == ["tracking", "all", "all"]
 
 
 def test_nothing_is_compiled_beforehand_twice_for_other_graphs_or_where_it_is_switched_off(compiled, monkeypatch):
-    compilation.compile_once(["dataset", "keypoints"], live=False)
+    compilation.compile_once(["dataset", "keypoints"], frames=60)
     compilation.marker("all").parent.mkdir(parents=True)
     compilation.marker("all").touch()
-    compilation.compile_once(sorted(compilation.STAGES), live=False)
+    compilation.compile_once(sorted(compilation.STAGES), frames=60)
     compilation.marker("all").unlink()
     monkeypatch.setenv("TRIHEDRON_COMPILE", "0")
-    compilation.compile_once(sorted(compilation.STAGES), live=True)
+    compilation.compile_once(sorted(compilation.STAGES), frames=None)
     assert compiled == []
 
 
