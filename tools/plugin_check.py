@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 
+from trihedron.datasets.simulation.synthetic import Synthetic
 from trihedron.pipeline.core.comments import field_comments
 from trihedron.pipeline.core.config import compose_run, default_plugins, graph_of
 from trihedron.pipeline.core.errors import RecordingError, TrihedronError
@@ -38,12 +39,22 @@ from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.run.live import is_camera
 from trihedron.pipeline.run.runner import Runner
 from trihedron.pipeline.run.scheduler import single_threaded_libraries
+from trihedron.tools.judged_calls import Call, Figure, figures_of_frames, worst
+from trihedron.tools.meanings import meanings_of
 from trihedron.tools.plugins import first_sentence
 
 ROOM = ("dataset=synthetic", "dataset.width=320", "dataset.height=240", "dataset.length=8")
 BEFORE = 3  # ordinary frames of an adverse scene, from which there are a map and previous values
 AFTER = 3  # adverse ones
+REPEATS = 10  # noisy ones of one view
+SAMPLED = 10  # frames of a data set that are read
 SLOWEST_MS = 10_000.0  # a call, beyond which a plugin hangs
+NEEDED = {  # slot -> words without which its plugins lack an input, or have nothing to do
+    "pose": ("model=tsdf",),
+    "map": ("dataset.fps=5", "dataset.length=12"),
+    "bundle": ("dataset.fps=5", "dataset.length=12"),
+    "loop": ("dataset.fps=5", "dataset.length=120"),
+}
 SILENT = ("bundle", "loop", "relocalise", "model")  # slots whose plugins may return nothing in a short sequence
 LIBRARIES = {"OpenCV": "cv2", "Open3D": "open3d", "COLMAP": "pycolmap", "SciPy": "scipy", "ONNX Runtime": "onnxruntime"}  # in docstrings -> module
 CLAUSES = ("What ", "Whether ", "How ", "Of ", "Where ", "Which ", "As ", "Those ")  # no docstring begins with
@@ -57,6 +68,12 @@ class Result:
     name: str
     good: bool
     detail: str
+    judged: bool = True  # False where there was nothing to judge
+
+    @property
+    def status(self) -> str:
+        """A word for the page: "-" is neither a success nor a failure."""
+        return ("ok" if self.good else "WRONG") if self.judged else "-"
 
 
 @dataclass(frozen=True)
@@ -132,7 +149,7 @@ class PluginCheck:
         if self.given is not None:
             return self.given
         outputs = [] if self.slot == "dataset" else [f"outputs=[{self.slot}]"]
-        return graph_of(compose_run([f"{self.slot}={self.name}", *outputs, *self.words])).stages[self.slot].plugin
+        return graph_of(compose_run([f"{self.slot}={self.name}", *outputs, *NEEDED.get(self.slot, ()), *self.words])).stages[self.slot].plugin
 
     @property
     def summary(self) -> str:
@@ -143,10 +160,10 @@ class PluginCheck:
         """Run the checks. Raises PluginError and ConfigError where the plugin cannot run here: a library or a file that it needs is missing."""
         static = self.static()
         if self.slot == "dataset":
-            return [*static, self._frames()]
+            return [*static, *self._frames()]
         if (failure := self._values()).good is False:
             return [*static, failure]
-        checks = [failure, self._adverse(), self._inputs(), self._state(), self._threads()]
+        checks = [failure, *self.meanings(), self._adverse(), self._inputs(), self._state(), self._threads()]
         checks += [] if quick else [self._processes(), self._replay()]
         return [*static, *checks, self._library(), self._differs(), self._time()]
 
@@ -163,8 +180,7 @@ class PluginCheck:
     @property
     def _upstream(self) -> tuple[str, ...]:
         """The words that do not configure this plugin, and those without which its inputs would be missing."""
-        needed = ("model=tsdf",) if self.slot == "pose" else ()
-        return (*needed, *(word for word in self.words if not word.startswith((f"{self.slot}.", f"{self.slot}="))))
+        return (*NEEDED.get(self.slot, ()), *(word for word in self.words if not word.startswith((f"{self.slot}.", f"{self.slot}="))))
 
     def _call_on_scene(self, scene: Scene) -> list[bytes]:
         """Bytes of the plugin's values in a scene, frame by frame; its own earlier values are its own."""
@@ -194,19 +210,27 @@ class PluginCheck:
             return Result("options", False, f"{option}={value!r} is out of range and is taken")
         return Result("options", True, f"{tried} values out of range are refused")
 
-    def _frames(self) -> Result:
-        """Frames of a data set: in order, by number, and again."""
+    def _frames(self) -> list[Result]:
+        """Frames of a data set: read in any order, with stamps in order, of one size, with depth."""
+        path = any(word.startswith("dataset.path=") for word in self.words)
+        if hasattr(self.plugin, "path") and not path:
+            return [Result("frames", True, "not read; give dataset.path=FOLDER", judged=False)]
+        if is_camera(self.plugin):
+            return [Result("frames", True, "not read: a camera", judged=False)]
         try:
-            count = min(len(self.plugin), BEFORE) if not is_camera(self.plugin) else 0
-            frames = [self.plugin(index=k) for k in range(count)]
-            again = [self.plugin(index=k) for k in reversed(range(count))][::-1]
+            rows = np.unique(np.linspace(0, len(self.plugin) - 1, SAMPLED).round().astype(int)).tolist()
+            frames = [self.plugin(index=k) for k in rows]
+            again = [self.plugin(index=k) for k in reversed(rows)][::-1]
+            truth = self.plugin.truth()
         except TrihedronError as error:
-            return Result("frames", True, f"not read: {error}")
-        for frame, other in zip(frames, again):
-            if not isinstance(frame, Frame) or not isinstance(other, Frame) or encode_value(frame) != encode_value(other):
-                return Result("frames", False, "a frame that is read twice is not the same")
-        stamps = [frame.stamp_ns for frame in frames if frame is not None]
-        return Result("frames", stamps == sorted(set(stamps)), f"{count} frames, stamps increase")
+            return [Result("frames", False, str(error))]
+        for row, frame, other in zip(rows, frames, again):
+            if not isinstance(frame, Frame) or not isinstance(other, Frame):
+                return [Result("frames", False, f"{self._words}: frame {row} of {len(self.plugin)} cannot be read")]
+            if encode_value(frame) != encode_value(other):
+                return [Result("frames", False, f"{self._words}: frame {row} that is read twice is not the same")]
+        found = [Result("frames", True, f"{len(frames)} of {len(self.plugin)} frames, read twice")]
+        return [*found, *(self._judge(name, worst(list(figures))) for name, figures in figures_of_frames(frames, truth).items())]
 
     def _values(self) -> Result:
         scene, found = room(self._upstream), 0
@@ -218,7 +242,7 @@ class PluginCheck:
                 validate_value(self.slot, value, "value")
                 check_together({**arguments, self.slot: value}, "value", {})
         except RecordingError as error:
-            return Result("values", False, error.cause)
+            return Result("values", False, f"{error.cause}, frame {value.index}")
         except TrihedronError:
             raise
         except Exception as error:
@@ -226,6 +250,37 @@ class PluginCheck:
         calls = 1 if self.slot in FOLDS else len(scene.values)
         silent = found == 0 and self.slot not in SILENT and self.name != "none"
         return Result("values", not silent, f"{found} of {calls} calls gave {output_of(self.slot).__name__}")
+
+    def meanings(self) -> Iterator[Result]:
+        """Judge what the slot promises beyond types and shapes, by the truth of rendered frames."""
+        if self.name == "none":
+            return
+        calls: dict[bool, list[Call]] = {}
+        for meaning in meanings_of(self.slot):
+            scene = repeats(self.slot, self._upstream) if meaning.repeats else room(self._upstream)
+            if not isinstance(scene.graph.stages["dataset"].plugin, Synthetic):
+                yield Result(meaning.name, True, "needs dataset=synthetic, whose truth is known", judged=False)
+                continue
+            try:
+                if meaning.repeats not in calls:
+                    calls[meaning.repeats] = judged_calls(self.plugin, self.slot, scene)
+                with np.errstate(all="ignore"):  # a figure that is not finite is outside of its limits
+                    figure = worst(list(meaning.check(calls[meaning.repeats])))
+            except RecordingError as error:
+                yield Result(meaning.name, False, f"{self._words}: {error.cause}")
+            except Exception as error:
+                yield Result(meaning.name, False, f"{self._words}: {type(error).__name__}: {' '.join(str(error).split())}")
+            else:
+                yield self._judge(meaning.name, figure)
+
+    def _judge(self, name: str, figure: Figure | None) -> Result:
+        if figure is None:
+            return Result(name, True, "no value that it could be judged on", judged=False)
+        return Result(name, figure.good, str(figure) if figure.good else f"{self._words}: {figure}")
+
+    @property
+    def _words(self) -> str:
+        return f"{self.slot}={self.name}"
 
     def _adverse(self) -> Result:
         count = 0
@@ -284,6 +339,8 @@ class PluginCheck:
             except TrihedronError as error:
                 return Result("replay", False, str(error))
             first, second = ([encode_value(v) for v in _topic(Path(folder) / run / "run.mcap", self.slot)] for run in ("run", "again"))
+        if not first and not second:
+            return Result("replay", True, "no value to compare", judged=False)
         return Result("replay", first == second, f"{len(first)} values are {'the same' if first == second else 'others'}")
 
     @property
@@ -298,8 +355,10 @@ class PluginCheck:
             return Result("library", True, "none is named")
         scene, called = room(self._upstream), set[str]()
         with modules_called(called):
-            values_of(self.plugin, self.slot, scene)
+            found = values_of(self.plugin, self.slot, scene)
         missing = [module for module in named if module not in called]
+        if missing and self.slot in SILENT and not any(value is not None for value in found):
+            return Result("library", True, f"no value, and no call of {', '.join(missing)}", judged=False)
         return Result("library", not missing, f"{', '.join(missing)} is named and not called" if missing else f"{', '.join(named)} called")
 
     def _differs(self) -> Result:
@@ -308,9 +367,15 @@ class PluginCheck:
             return Result("differs", True, "it is the default")
         scene = room(self._upstream)
         plugin = graph_of(compose_run([f"outputs=[{self.slot}]", *self._upstream])).stages[self.slot].plugin
-        differing = sum(a != b for a, b in zip(self._call_on_scene(scene), [encode_value(v) for v in values_of(plugin, self.slot, scene)]))
-        good = differing > 0 or not self._named_modules or self.slot in SILENT  # other methods may agree in a plain room
-        return Result("differs", good, f"from {default} in {differing} values")
+        pairs = list(zip(values_of(self.plugin, self.slot, scene), values_of(plugin, self.slot, scene)))
+        pairs = [(a, b) for a, b in pairs if a is not None or b is not None]
+        differing = sum(encode_value(a) != encode_value(b) for a, b in pairs)
+        if differing:
+            return Result("differs", True, f"from {default} in {differing} of {len(pairs)} values")
+        if not pairs:
+            return Result("differs", True, f"no value of it or of {default} to compare", judged=False)
+        good = not self._named_modules or self.slot in SILENT  # other methods may agree in a plain room
+        return Result("differs", good, f"all {len(pairs)} values are those of {default}, the default", judged=not good)
 
     def _time(self) -> Result:
         scene, spent = room(self._upstream), list[float]()
@@ -327,6 +392,12 @@ class PluginCheck:
 def room(words: tuple[str, ...]) -> Scene:
     """The room, seen by the default graph with these words."""
     return _scene("room", words, None)
+
+
+@lru_cache(maxsize=8)
+def repeats(slot: str, words: tuple[str, ...]) -> Scene:
+    """Noisy repeats of one view of the room, as far as the slot's inputs need it."""
+    return _scene("repeats", (*words, "dataset.scene=room", "dataset.motion=still", f"dataset.length={REPEATS}"), None)
 
 
 def adverse(slot: str, words: tuple[str, ...]) -> Iterator[Scene]:
@@ -398,6 +469,18 @@ def calls_of(plugin: Any, slot: str, scene: Scene, watch: bool = False, spent: l
         if slot in FOLDS:
             maps = [value["map"] for value in scene.values if value.get("map") is not None]
             yield {}, plugin.finish(state, maps[-1] if maps else None)
+
+
+def judged_calls(plugin: Any, slot: str, scene: Scene) -> list[Call]:
+    """The calls that gave a value, with the truth of a synthetic scene."""
+    data, found, map = scene.graph.stages["dataset"].plugin, list[Call](), None
+    for position, value in enumerate(values_of(plugin, slot, scene)):
+        at = len(scene.values) - 1 if slot in FOLDS else position
+        topics, previous = scene.values[at], scene.values[at - 1] if at else {}
+        if value is not None and isinstance(topics.get("dataset"), Frame):
+            found.append(Call(value, topics["dataset"], topics, previous, map, data, at))
+        map = topics["map"] if topics.get("map") is not None else map
+    return found
 
 
 def _stage(plugin: Any, slot: str, scene: Scene) -> Stage:

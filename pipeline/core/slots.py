@@ -80,7 +80,8 @@ class KeypointsSlot(Protocol):
 
 
 class LinesSlot(Protocol):
-    """Straight line segments of the image with descriptors. Measure: share of the segments in view that are not found again in the next frame."""
+    """Straight line segments with descriptors, inside the image, which reaches from -0.5 to its width or height - 0.5.
+    Measure: share of the segments in view that are not found again in the next frame."""
 
     def __call__(self, frame: Frame) -> LineSegments | None: ...
 
@@ -93,7 +94,8 @@ class SegmentsSlot(Protocol):
 
 
 class PlanesSlot(Protocol):
-    """Planar regions of the depth image. Measure: distance and angle between one plane in two frames, and the share that is not found again."""
+    """Planar regions of the depth image. `moments` may be those of a part of a region, the points that the plane was fitted to.
+    Measure: distance and angle between one plane in two frames, and the share that is not found again."""
 
     def __call__(self, frame: Frame, normals: Normals) -> Planes | None: ...
 
@@ -107,7 +109,8 @@ class ManhattanSlot(Protocol):
 
 
 class TracksSlot(Protocol):
-    """Features of this frame found in the previous one. `previous` is this stage's last output, `manhattan` may predict the rotation.
+    """Features of this frame found in the previous one. A row is paired at most once, but a previous plane may come apart.
+    `previous` is this stage's last output, `manhattan` may predict the rotation.
     Measure: shares of wrong and of missed pairs of key points."""
 
     def __call__(
@@ -177,7 +180,8 @@ class MatchesSlot(Protocol):
 
 class PoseSlot(Protocol):
     """The pose of this frame with its status (section IV-C, eq. 8): every frame gets a pose, `ok` or `degraded` only when it was estimated
-    from this frame's measurements. `map` is the map before this frame, `previous` this stage's last output; on a lost one nothing is tracked.
+    from this frame's measurements; the error of an `ok` one is within its covariance. `map` is the map before this frame, `previous` this stage's
+    last output; on a lost one nothing is tracked.
     Measure: ATE, RPE, NEES and the share of frames that are ok."""
 
     def __call__(

@@ -1,6 +1,7 @@
 """Plugins with a known fault, for tests of what finds it."""
 
 from dataclasses import dataclass, replace
+from functools import wraps
 
 import numpy as np
 import pytest
@@ -38,6 +39,18 @@ class NoisyPlanes:
         planes[:, :3] /= np.linalg.norm(planes[:, :3], axis=1)[:, None]
         planes[:, 3] = np.maximum(planes[:, 3] + noise[:, 2], 0.0)
         return replace(found, coefficients=planes)
+
+
+def broken(kind, change):
+    """A plugin with the inputs of another, whose values it changes."""
+
+    class Broken(kind):
+        @wraps(kind.__call__)
+        def __call__(self, **inputs):
+            value = super().__call__(**inputs)
+            return None if value is None else change(value)
+
+    return Broken()
 
 
 @pytest.fixture
