@@ -53,8 +53,6 @@ def line_segments(options: LineOptions, frame: Frame, small: U8, found: F32 | F6
         border_px=float(options.border_px),
         reach_px=options.reach_px,
     )
-    height, width = frame.gray.shape
-    within = np.array([width - 0.5, height - 0.5], np.float32)  # to where the border pixels reach
-    endpoints = np.clip(place_segments(frame.gray, lines, options.scale, rules, options.segments), np.float32(-0.5), within)
+    endpoints = place_segments(frame.gray, lines, options.scale, rules, options.segments)
     descriptors = line_band_descriptors(small, endpoints, options.scale, options.band_px, 2.0)
     return LineSegments(index=frame.index, stamp_ns=frame.stamp_ns, endpoints_px=endpoints, descriptors=descriptors)
