@@ -55,11 +55,11 @@ def true_normals(call: Call) -> Iterator[Figure]:
 # Key points.
 
 
-def _outside(call: Call, pixels: F64) -> Iterator[Figure]:
+def _outside(call: Call, pixels: F64, most: float = 0.0) -> Iterator[Figure]:
     camera = call.frame.camera
     if len(pixels):
         beyond = np.maximum(-0.5 - pixels, pixels - [camera.width - 0.5, camera.height - 0.5]).max()
-        yield Figure("distance of a point outside of the image", max(float(beyond), 0.0), "px", most=0.0)
+        yield Figure("distance of a point outside of the image", max(float(beyond), 0.0), "px", most=most)
 
 
 def keypoints_inside(call: Call) -> Iterator[Figure]:
@@ -150,9 +150,9 @@ def _descriptor_distances(a: NDArray[np.uint8], b: NDArray[np.uint8], metric: st
 
 
 def lines_inside(call: Call) -> Iterator[Figure]:
-    """End points lie in the image, apart."""
+    """End points lie in the image or within a pixel of it, apart."""
     ends = call.value.endpoints_px.astype(np.float64)
-    yield from _outside(call, ends.reshape(-1, 2))
+    yield from _outside(call, ends.reshape(-1, 2), most=1.0)
     if len(ends):
         yield Figure("least length of a line", float(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).min()), "px", least=1.0)
 

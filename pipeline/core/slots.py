@@ -80,7 +80,7 @@ class KeypointsSlot(Protocol):
 
 
 class LinesSlot(Protocol):
-    """Straight line segments with descriptors, inside the image, which reaches from -0.5 to its width or height - 0.5.
+    """Straight line segments with descriptors; end points lie in the image (-0.5 to its width or height - 0.5), or within a pixel of it.
     Measure: share of the segments in view that are not found again in the next frame."""
 
     def __call__(self, frame: Frame) -> LineSegments | None: ...
