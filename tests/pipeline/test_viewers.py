@@ -273,7 +273,8 @@ class Kept:
     """A command that goes on serving. `line` is the one that says so; what it printed before is in `printed`."""
 
     def __init__(self, *words: str) -> None:
-        command = [sys.executable, "-c", "import sys; from trihedron.pipeline.app.cli import main; sys.exit(main())", *words]
+        listen = "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "  # which a shell's background jobs ignore
+        command = [sys.executable, "-c", listen + "from trihedron.pipeline.app.cli import main; sys.exit(main())", *words]
         self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
         self.printed: list[str] = []
         assert self.process.stdout is not None
