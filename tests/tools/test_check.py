@@ -259,7 +259,7 @@ MUTANTS = {  # name -> the plugin, what a mutant of it does to its values, the c
     ),
     "lines: outside of the image": (
         Lsd, lambda v: moved(v, 1, -240.0),
-        "in the image", "distance of a point outside of the image is 236 px, must be at most 0, frame 0",
+        "in the image", "distance of a point outside of the image is 236 px, must be at most 1, frame 0",
     ),
     "manhattan: wrong angle": (
         MeanShift, lambda v: rotated(v, 10.0),
