@@ -60,7 +60,7 @@ def _write_picture(recording: Recording, path: Path, images: bool) -> str:
 
 def draw_surface(surface: Surface, size: tuple[int, int] = SIZE, images: bool = False) -> tuple[U8, int]:
     """Draw a surface, its planes or the colours of the images: (h, w, 3) RGB, and the number of triangles that are shown."""
-    shown = np.flatnonzero(_visible_triangles(surface)).astype(np.int32)
+    shown = np.flatnonzero(visible_triangles(surface)).astype(np.int32)
     w, h = size
     if len(shown) == 0:
         return np.full((h, w, 3), int(PAPER), np.uint8), 0
@@ -78,7 +78,7 @@ def draw_surface(surface: Surface, size: tuple[int, int] = SIZE, images: bool = 
     return np.clip(cv2.resize(full, size, interpolation=cv2.INTER_AREA), 0, 255).astype(np.uint8), len(shown)
 
 
-def _visible_triangles(surface: Surface) -> Bool:
+def visible_triangles(surface: Surface) -> Bool:
     """(t,) True for the triangles that are no ceiling, lie below it, and belong to no small island of those."""
     triangles, vertices = surface.triangles, surface.vertices_m @ upright(surface.up).T
     if len(triangles) == 0:
