@@ -5,15 +5,15 @@ images, rerun what `trihedron view` shows, all in the world of trajectory.txt. M
 turned so that up, an axis of the Manhattan frame, is +z (ply, obj,
 planes.json) or +y (gltf, a .glb file, by its standard), and what the first camera saw is ahead: +y, or -z.
 With --covariance, tum is the poses as they were estimated at the time, and a file
-beside it (.cov) their covariances, which smfeval judges.
+beside it (.cov) their covariances, which smfeval judges. With --images, png has the colours of the images.
 
 Example: trihedron export runs/latest --to colmap
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from trihedron.pipeline.app.recorded_values import open_recording
@@ -23,6 +23,7 @@ from trihedron.tools.arguments import Parser
 
 RECORDING = "run.mcap"
 BY_ENDING = {"glb": "gltf", "rrd": "rerun"}  # endings of files that are given for the names of their formats
+FLAGS = {"covariance": "with the covariance of each pose (tum)", "images": "in the colours of the images, not of the planes (png)"}
 
 
 @dataclass(frozen=True)
@@ -32,7 +33,7 @@ class Format:
     name: str  # as given to --to
     file: str  # its default name, in the run folder
     write: Callable[[Recording, Path], str]
-    covariance: Format | None = None  # with --covariance, where it can hold one
+    variants: Mapping[str, Format] = field(default_factory=dict)  # name of a flag -> what is written with it
 
 
 def formats() -> dict[str, Format]:
@@ -49,17 +50,18 @@ def main(argv: list[str]) -> int:
     parser.add_argument("run", metavar="RUN", type=Path, help="a run folder or its recording")
     parser.add_argument("--to", metavar="FORMAT", required=True, help=f"one of {', '.join(formats())}; glb and rrd too")
     parser.add_argument("--out", metavar="FILE", type=Path, help="(default: in the run folder)")
-    parser.add_argument("--covariance", action="store_true", help="with the covariance of each pose (tum)")
+    for flag, meaning in FLAGS.items():
+        parser.add_argument(f"--{flag}", action="store_true", help=meaning)
     arguments = parser.parse_args(argv)
     name = BY_ENDING.get(arguments.to, arguments.to)
     if name not in formats():
         raise UsageError("export", f"there is no format '{name}'", did_you_mean(name, formats()))
     chosen = formats()[name]
-    if arguments.covariance:
-        if chosen.covariance is None:
-            able = ", ".join(format.name for format in formats().values() if format.covariance)
-            raise UsageError("export", f"the format '{chosen.name}' holds no covariances", f"give --to {able}, or leave out --covariance")
-        chosen = chosen.covariance
+    for flag in (flag for flag in FLAGS if vars(arguments)[flag]):
+        if flag not in chosen.variants:
+            able = ", ".join(format.name for format in formats().values() if flag in format.variants)
+            raise UsageError("export", f"--{flag} is not for the format '{name}'", f"give --to {able}, or leave out --{flag}")
+        chosen = chosen.variants[flag]
     recording: Path = arguments.run / RECORDING if arguments.run.is_dir() else arguments.run
     out: Path = arguments.out or recording.parent / chosen.file
     try:

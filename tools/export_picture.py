@@ -1,4 +1,4 @@
-"""A picture of a surface, seen from above, from the side that shows most: as coloured by the views, and each plane in a colour of its own.
+"""A picture of a surface, seen from above, from the side that shows most: planes in colours that differ, or as coloured by the views.
 
 The ceiling is cut away, islands of less than `ISLAND` of the area are dropped, and the frame holds 98 % of the vertices. Triangles are seen from
 their front alone, so that walls that stand in the way do not."""
@@ -23,7 +23,9 @@ SIZE = (1920, 1200)  # px, of the picture
 SUPERSAMPLING = 2  # pixels drawn for one of the picture, in each direction
 ELEVATION_DEG, AZIMUTHS = 40.0, 24  # height of the viewer, and the directions that are tried
 ISLAND = 0.05  # share of the area below which a connected component is dropped
+SPECK = 0.01  # share of the pixels drawn below which a connected component is dropped
 CEILING_M = 0.05  # below the ceiling, what is cut away with it
+COPLANAR_DEG, COPLANAR_M = 2.0, 0.01  # planes that differ by less share a colour
 FRAMED = (0.5, 99.5)  # percentiles between two edges of the frame, which holds 98 % of the vertices
 MARGIN = 0.04  # of the frame
 PAPER, LIGHT, SHADE = 255.0, 0.88, 0.14
@@ -39,49 +41,57 @@ PALETTE = np.array(
 )  # fmt: skip
 
 
-def write_picture(recording: Recording, path: Path) -> str:
-    """PNG: two views beside or above each other, whichever is larger."""
-    picture, count = draw_surface(surface_of(recording))
+def write_planes_picture(recording: Recording, path: Path) -> str:
+    """PNG: planes in colours that differ."""
+    return _write_picture(recording, path, images=False)
+
+
+def write_images_picture(recording: Recording, path: Path) -> str:
+    """PNG: as coloured by the views."""
+    return _write_picture(recording, path, images=True)
+
+
+def _write_picture(recording: Recording, path: Path, images: bool) -> str:
+    picture, count = draw_surface(surface_of(recording), images=images)
     write_file(path, bytes(cv2.imencode(".png", picture[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9])[1]))
-    size = f"{picture.shape[1]} × {picture.shape[0]} px"
-    return f"{size}, {count} triangles below the ceiling, as they were seen and by planes" if count else f"{size}, empty: no surface"
+    size, colors = f"{picture.shape[1]} × {picture.shape[0]} px", "the images" if images else "the planes"
+    return f"{size}, {count} triangles below the ceiling in the colours of {colors}" if count else f"{size}, empty: no surface"
 
 
-def draw_surface(surface: Surface, size: tuple[int, int] = SIZE) -> tuple[U8, int]:
-    """Draw a surface: (h, w, 3) RGB, and the number of triangles that are shown."""
-    shown = np.flatnonzero(_visible_triangles(surface)).astype(np.int32)
+def draw_surface(surface: Surface, size: tuple[int, int] = SIZE, images: bool = False) -> tuple[U8, int]:
+    """Draw a surface, its planes or the colours of the images: (h, w, 3) RGB, and the number of triangles that are shown."""
+    shown = np.flatnonzero(visible_triangles(surface)).astype(np.int32)
     w, h = size
     if len(shown) == 0:
         return np.full((h, w, 3), int(PAPER), np.uint8), 0
     points, lit = _view_vertices(surface, shown)
     low, high = _frame(points, surface.triangles[shown])
-    half = max(((w // 2, h), (w, h // 2)), key=lambda part: _scale(part, high - low))  # beside each other or above
-    triangle, weights, depth = _rasterise_triangles(points, surface.triangles[shown], half, low, high)
-    triangle = np.where(triangle >= 0, shown[triangle], -1).astype(np.int32)
-    light = lit[triangle] * (1.0 - EDGE * _outlines(surface.instances[triangle], depth))
-    halves = []
-    for color in (_brighten_colors(_colors(surface, triangle, weights)), _tints(surface, triangle)):
-        full = np.where((triangle >= 0)[..., None], color * light[..., None], PAPER).astype(np.float32)
-        halves.append(cv2.resize(full, half, interpolation=cv2.INTER_AREA))
-    return np.clip(np.concatenate(halves, axis=1 if half[1] == h else 0), 0, 255).astype(np.uint8), len(shown)
+    triangle, weights, depth = _rasterise_triangles(points, surface.triangles[shown], size, low, high)
+    triangle = np.where(remove_specks(triangle >= 0), shown[triangle], -1).astype(np.int32)
+    if images:
+        color, instance = _brighten_colors(_colors(surface, triangle, weights)), surface.instances[triangle]
+    else:
+        instance = _merge_coplanar(surface)[np.where(triangle >= 0, surface.instances[triangle], -1)]
+        color = _tints(surface, instance)
+    light = lit[triangle] * (1.0 - EDGE * _outlines(instance, depth))
+    full = np.where((triangle >= 0)[..., None], color * light[..., None], PAPER).astype(np.float32)
+    return np.clip(cv2.resize(full, size, interpolation=cv2.INTER_AREA), 0, 255).astype(np.uint8), len(shown)
 
 
-def _visible_triangles(surface: Surface) -> Bool:
-    """(t,) True for the triangles that are no ceiling, lie below it, and belong to no small island."""
+def visible_triangles(surface: Surface) -> Bool:
+    """(t,) True for the triangles that are no ceiling, lie below it, and belong to no small island of those."""
     triangles, vertices = surface.triangles, surface.vertices_m @ upright(surface.up).T
     if len(triangles) == 0:
         return np.zeros(0, bool)
     corners = vertices[triangles]
-    areas = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    edges = np.concatenate([triangles[:, :2], triangles[:, 1:]])
+    ceiling = np.append(surface.kinds == PLANE_KINDS.index("ceiling"), False)[surface.instances]
+    lowest = corners[ceiling, :, 2].min() - CEILING_M if ceiling.any() else np.inf
+    below = np.asarray(~ceiling & (corners[:, :, 2].min(axis=1) < lowest))
+    areas = below * 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    edges = np.concatenate([triangles[below, :2], triangles[below, 1:]])
     _, labels = connected_components(coo_array((np.ones(len(edges), bool), edges.T), shape=2 * (len(vertices),)), directed=False)
     component = labels[triangles[:, 0]]
-    large = np.asarray(np.bincount(component, areas)[component] >= ISLAND * areas.sum())
-    ceiling = np.append(surface.kinds == PLANE_KINDS.index("ceiling"), False)[surface.instances]
-    if not ceiling.any():
-        return large
-    lowest = corners[ceiling, :, 2].min() - CEILING_M
-    return np.asarray(large & ~ceiling & (corners[:, :, 2].min(axis=1) < lowest))
+    return np.asarray(below & (np.bincount(component, areas)[component] >= ISLAND * areas.sum()))
 
 
 def _view_vertices(surface: Surface, shown: I32) -> tuple[F64, F64]:
@@ -119,9 +129,9 @@ def _scale(size: tuple[int, int], extent: F64) -> float:
     return (1.0 - 2.0 * MARGIN) * float(np.min(size / np.maximum(extent, 1e-6)))
 
 
-def _rasterise_triangles(points: F64, triangles: I32, half: tuple[int, int], low: F64, high: F64) -> tuple[I32, F32, F32]:
+def _rasterise_triangles(points: F64, triangles: I32, size: tuple[int, int], low: F64, high: F64) -> tuple[I32, F32, F32]:
     """(h, w) row of the triangle seen in a pixel, -1 = none, (h, w, 3) its weights of the corners, and (h, w) the depth from 0 to 1; supersampled."""
-    w, h = (SUPERSAMPLING * side for side in half)
+    w, h = (SUPERSAMPLING * side for side in size)
     away = points[np.unique(triangles), 2]
     placed = points - np.append(0.5 * (low + high), away.min())
     placed[:, :2] = placed[:, :2] * _scale((w, h), high - low) + 0.5 * np.array([w, h])
@@ -155,6 +165,13 @@ def _rasterise(points: F64, triangles: I32, triangle: I32, weights: F32, nearest
                     weights[y, x, 0], weights[y, x, 1], weights[y, x, 2] = u, v, s
 
 
+def remove_specks(drawn: Bool) -> Bool:
+    """(h, w) pixels that are drawn, without the connected components that are a small share of them."""
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(drawn.astype(np.uint8))
+    large = stats[:, cv2.CC_STAT_AREA] >= SPECK * drawn.sum()
+    return np.asarray(drawn & large[labels])
+
+
 def _outlines(instance: I32, depth: F32) -> F64:
     """(h, w) 1 where a plane, or what stands before something else, ends."""
     behind = np.where(np.isfinite(depth), depth, 2.0)
@@ -167,15 +184,29 @@ def _outlines(instance: I32, depth: F32) -> F64:
     return edge
 
 
-def _tints(surface: Surface, triangle: I32) -> F64:
-    """(h, w, 3) RGB: planes in colours of the palette, of which planes that touch in the picture share none as long as there are enough."""
+def _merge_coplanar(surface: Surface) -> I32:
+    """(p + 1,) row of the largest plane that each continues, of those before the last, which is no plane."""
+    normals, order = surface.coefficients[:, :3], np.argsort(-surface.areas_m2, kind="stable")
+    aligned = normals @ normals.T > np.cos(np.radians(COPLANAR_DEG))
+    largest = np.append(np.arange(len(order), dtype=np.int32), np.int32(-1))
+    for rank, small in enumerate(order):
+        points = surface.vertices_m[np.unique(surface.triangles[surface.instances == small])]
+        for large in order[:rank]:
+            if aligned[small, large] and np.median(np.abs(points @ normals[large] + surface.coefficients[large, 3])) < COPLANAR_M:
+                largest[small] = largest[large]
+                break
+    return largest
+
+
+def _tints(surface: Surface, instance: I32) -> F64:
+    """(h, w, 3) RGB for rows of planes (h, w): planes in colours of the palette, of which those that touch share none as long as there are enough."""
     count = len(surface.plane_ids)
-    instance = np.where(triangle >= 0, surface.instances[triangle], -1)
     near = np.zeros((count + 1, count + 1), bool)  # the last is no plane
     for one, other in ((instance[:, :-1], instance[:, 1:]), (instance[:-1], instance[1:])):
         near[one, other] = near[other, one] = True
     chosen, used = np.full(count + 1, -1), np.zeros(len(PALETTE), int)
-    for plane in np.argsort(-surface.areas_m2, kind="stable"):
+    seen = np.unique(instance[instance >= 0])
+    for plane in seen[np.argsort(-surface.areas_m2[seen], kind="stable")]:
         around = np.bincount(chosen[:count][near[plane, :count] & (chosen[:count] >= 0)], minlength=len(PALETTE))
         chosen[plane] = int(np.lexsort((used, around))[0])  # of those least around, the least used
         used[chosen[plane]] += 1
@@ -200,4 +231,4 @@ def _colors(surface: Surface, triangle: I32, weights: F32) -> F64:
     return np.asarray(out, np.float64)
 
 
-FORMATS = (Format("png", "surface.png", write_picture),)
+FORMATS = (Format("png", "surface.png", write_planes_picture, {"images": Format("png", "surface.png", write_images_picture)}),)

@@ -105,7 +105,7 @@ def _stage_columns(topic: str, value: Any) -> dict[str, Any]:
 
 
 FORMATS = (
-    Format("tum", "trajectory_final.txt", write_tum, Format("tum", "trajectory_estimated.txt", write_tum_with_covariance)),
+    Format("tum", "trajectory_final.txt", write_tum, {"covariance": Format("tum", "trajectory_estimated.txt", write_tum_with_covariance)}),
     Format("kitti", "trajectory_kitti.txt", write_kitti),
     Format("csv", "frames.csv", write_csv),
 )

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from trihedron.pipeline.core.drawings import Solid
 from trihedron.pipeline.core.types import DEGRADED, F64, LOST, OK, U8, Surface
+from trihedron.tools.export_picture import visible_triangles
 from trihedron.tools.export_surface import upright
 
 WIDTH, HEIGHT = 560, 240
@@ -100,8 +101,8 @@ def curves_figure(title: str, unit: str, curves: Sequence[tuple[F64, F64]]) -> F
 
 
 def stage_figure(runs: Sequence[dict[str, Any]]) -> Figure | None:
-    """Draw the median time of each stage in each run as bars, ms."""
-    stages = dict.fromkeys(stage for found in runs for stage in found)
+    """Draw the median time of each stage in each run as bars, ms; without the data set, which reads or renders the frames."""
+    stages = dict.fromkeys(stage for found in runs for stage in found if stage != "dataset")
     bars = [(stage, k, found[stage]["p50_ms"]) for stage in stages for k, found in enumerate(runs) if (found.get(stage) or {}).get("p50_ms")]
     if not bars:
         return None
@@ -115,7 +116,10 @@ def stage_figure(runs: Sequence[dict[str, Any]]) -> Figure | None:
         if len(runs) <= MOST_LABELLED:
             parts.append(f'<text x="{left + scale * ms + 5:.1f}" y="{y + 15}">{ms:.1f}</text>')
     listed = ", ".join(f"{stage} {ms:.1f}" for stage, _, ms in bars)
-    return Figure(_svg("".join(parts), f"Median ms of the stages: {listed}", row * len(bars) + 12), "Median time of each stage, ms.")
+    return Figure(
+        _svg("".join(parts), f"Median ms of the stages: {listed}", row * len(bars) + 12),
+        "Median time of each stage, ms, without reading or rendering frames.",
+    )
 
 
 def status_figure(statuses: Sequence[str], seconds: Sequence[float]) -> Figure:
@@ -141,10 +145,12 @@ def status_figure(statuses: Sequence[str], seconds: Sequence[float]) -> Figure:
 
 
 def surface_mesh(surface: Surface, most: int) -> Mesh | None:
-    """Return a surface, simplified to some number of triangles at most; None for an empty one."""
-    vertices, colors, triangles = surface.vertices_m @ upright(surface.up).T, surface.colors, surface.triangles.astype(np.int64)
-    if not len(triangles):
+    """Return a surface without its ceiling and small islands, simplified to some number of triangles at most; None where nothing is left."""
+    shown = surface.triangles[visible_triangles(surface)]
+    if not len(shown):
         return None
+    used, corners = np.unique(shown, return_inverse=True)
+    vertices, colors, triangles = surface.vertices_m[used] @ upright(surface.up).T, surface.colors[used], corners.reshape(-1, 3)
     cell = float(np.linalg.norm(vertices.max(axis=0) - vertices.min(axis=0))) / 1000
     while len(triangles) > most or len(vertices) > MOST_VERTICES:
         vertices, colors, triangles = _cluster_vertices(vertices, colors, triangles, cell)

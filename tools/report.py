@@ -1,5 +1,5 @@
-"""Write one page of HTML about some runs: trajectories, surface and building in 3D, floor plans, errors over time, times of the stages, what the
-configurations differ in, and a frame of each run with its features, planes and axes.
+"""Write one page of HTML about some runs: trajectories, surface and building in 3D, floor plans, errors over time, times of the stages, options
+that are not their defaults, and a frame of each run with its features, planes and axes.
 
 The page needs no network. FOLDER is a run, or a sweep.
 
@@ -19,10 +19,10 @@ from trihedron.comparison.runs import OVERRIDES, Run, read_runs, rows_of
 from trihedron.pipeline.core.errors import DataError, TrihedronError
 from trihedron.pipeline.core.files import write_file
 from trihedron.pipeline.run.result_files import read_results
-from trihedron.pipeline.run.results import flatten_dict
 from trihedron.pipeline.run.stated_sigma import CAUSES, dominant_cause
 from trihedron.tools.arguments import Parser
 from trihedron.tools.pages import render
+from trihedron.tools.run_configurations import changed_options
 from trihedron.tools.run_pages import MOST_PICTURES, RECORDING, TRAJECTORY, RunFacts, drawings_of, facts_of, frame_picture
 
 TITLE_NAMES = 6
@@ -55,7 +55,7 @@ def page(runs: Sequence[Run], title: str | None = None) -> str:
         origins=_table("Origins", "The commands as they were given.", ["run", "data set", "date", "command"], [*map(_origin, facts, facts.values())]),
         results=_table("Results", "± is half the distance from the smallest to the largest.", header, cells),
         sigmas=_sigmas({name: run.folder for name, run in named.items()}),
-        configurations=_configurations(facts),
+        configurations=changed_options(facts),
         frames=[_frame(name, run.folder) for name, run in list(named.items())[:MOST_PICTURES]],
         **drawings_of({name: run.folder for name, run in named.items()}, MOST_TRIANGLES),
     )
@@ -78,14 +78,6 @@ def _origin(name: str, facts: RunFacts) -> tuple[str, ...]:
     """Name, data set, date and command of a run."""
     date = datetime.fromtimestamp((facts.run.folder / OVERRIDES).stat().st_mtime).astimezone().strftime("%Y-%m-%d %H:%M %Z")
     return name, facts.data_set, date, shlex.join(["trihedron", "run", *facts.words])
-
-
-def _configurations(runs: Mapping[str, RunFacts]) -> dict[str, Any]:
-    """Every value of the composed configurations that is not the same in all runs; an option that a run's plugin does not have is a dash."""
-    flat = [flatten_dict(facts.config) for facts in runs.values()]
-    keys = sorted({key for values in flat for key in values} - {"out"})
-    rows = [[key, *(str(values.get(key, "-")) for values in flat)] for key in keys if len({repr(values.get(key)) for values in flat}) > 1]
-    return _table("Configurations", "Options that differ; - where a plugin has no such option.", ["option", *runs], rows)
 
 
 def _sigmas(folders: Mapping[str, Path]) -> dict[str, Any]:

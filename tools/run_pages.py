@@ -199,8 +199,8 @@ def frame_picture(folder: Path) -> dict[str, Any]:
         return embed_picture(file, "The middle frame with planes, 3D lines, key points and Manhattan axes; the map from above")
 
 
-def run_page(facts: RunFacts, title: str, other_commit: bool, pictures: bool) -> str:
-    """Return the page of a run as HTML."""
+def run_page(facts: RunFacts, title: str, other_commit: bool, pictures: bool, configurations: dict[str, Any]) -> str:
+    """Return the page of a run as HTML, with a table of its configuration."""
     folder = facts.run.folder
     try:
         frames = [frame_picture(folder)] if pictures else []
@@ -215,6 +215,7 @@ def run_page(facts: RunFacts, title: str, other_commit: bool, pictures: bool) ->
         command=facts.command,
         checksums=[(name, file_sha256(folder / name)) for name in (TRAJECTORY, SURFACE, RECORDING) if (folder / name).is_file()],
         frames=[{"text": found["alt"], "picture": found} for found in frames if found],
+        configurations=configurations,
         config=yaml.safe_dump(facts.config, sort_keys=False),
         **drawings_of({"ours": folder}),
     )

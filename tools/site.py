@@ -25,6 +25,7 @@ from trihedron.pipeline.core.files import MAX_YAML_BYTES, YamlError, make_folder
 from trihedron.tools import published
 from trihedron.tools.arguments import Parser
 from trihedron.tools.pages import render
+from trihedron.tools.run_configurations import changed_options
 from trihedron.tools.run_pages import RunFacts, facts_of, run_page
 from trihedron.tools.site_ablations import Ablation, ablation_page, ablations_of
 
@@ -145,7 +146,8 @@ def write_site(
     columns = [name for name in COLUMNS if any(name in cell.row["figures"] for cell in cells)]
     for cell in cells:
         for facts in cell.facts:
-            page = run_page(facts, f"{_system(cell)}, {_data_title(cell)}", facts.commit != commit, pictures)
+            title_of_run = f"{_system(cell)}, {_data_title(cell)}"
+            page = run_page(facts, title_of_run, facts.commit != commit, pictures, changed_options({"value": facts}))
             write_file(out / "runs" / f"{names[facts.run.folder]}.html", page)
     for ablation in ablations:
         make_folder(out / "ablations")

@@ -11,8 +11,12 @@ import html5lib
 import numpy as np
 import pytest
 
+from trihedron.comparison.runs import Run
 from trihedron.pipeline.app.cli import main
+from trihedron.tools.run_configurations import changed_options
+from trihedron.tools.run_pages import RunFacts
 
+SVD = {"plugin": "plane_svd", "gate": 2.5, "loyalty": 1.2}
 ROOM = ["dataset.width=160", "dataset.height=120", "dataset.length=20"]
 
 
@@ -31,9 +35,30 @@ def test_a_page_is_valid_and_needs_no_network(page):
     html5lib.HTMLParser(strict=True).parse(text)
     assert not re.findall(r"""(?:src|href)\s*=\s*["']?(?:https?:)?//|@import|url\(""", text) and len(text) < 1_000_000
     assert len(re.findall("<img[^>]*data:image/jpeg;base64,", text)) == 2 and text.count("<figure><svg") == 3
-    assert '<th scope="row">dataset.seed</th><td>0</td><td>1</td>' in text
+    assert text.count("<h2>Paths and surface in 3D</h2>") == text.count('aria-label="Paths of the camera and surface in 3D; ') == 1
+    assert "The surface has no ceiling and no small islands here." in text
     scene = json.loads(re.findall(r'id="scene">(.*?)</script>', text)[0])
     assert [path["name"] for path in scene["paths"]] == ["0", "1", "ground truth"] and [mesh["name"] for mesh in scene["meshes"]] == ["surface"]
+
+
+def test_configurations_are_differences_from_the_defaults(page, tmp_path):
+    options = page.read_text().partition("<h2>Configurations</h2>")[2]
+    rows = dict(re.findall(r'<th scope="row">([^<]*)</th>((?:<td[^>]*>[^<]*</td>)*)</tr>', options))
+    assert list(rows) == ["dataset.height", "dataset.length", "dataset.seed", "dataset.width", "outputs"]
+    assert rows["dataset.width"] == "<td>160</td><td>160</td>" and rows["dataset.seed"] == "<td>0 (default)</td><td>1</td>"
+    assert rows["outputs"] == "<td>[trajectory,surface]</td><td>[trajectory] (default)</td>"
+    swapped, plain = (
+        RunFacts(Run(tmp_path, {}, {}), "", "", (), config, 20) for config in ({"manhattan": SVD}, {"dataset": {"plugin": "synthetic"}})
+    )
+    assert changed_options({"a": swapped, "b": plain})["rows"] == [["manhattan", "plane_svd", "-"], ["manhattan.gate", "2.5", "-"]]
+    assert changed_options({"b": plain})["rows"] == []
+
+
+def test_a_page_without_a_surface_has_the_path_alone_and_no_times_of_the_renderer(page, tmp_path):
+    assert main(["report", str(page.parent / "1"), "--out", str(tmp_path / "page.html")]) == 0
+    text = (tmp_path / "page.html").read_text()
+    assert "<h2>Paths in 3D</h2>" in text and 'aria-label="Paths of the camera in 3D; ' in text and "The surface has" not in text
+    assert "Median ms of the stages: normals " in text and "Median time of each stage, ms, without reading or rendering frames." in text
 
 
 def test_names_of_runs_are_escaped(page, tmp_path):
@@ -109,5 +134,9 @@ def test_a_browser_draws_it(page):
         runs = [int((np.abs(drawn - color).max(axis=-1) < 30).sum()) for color in ((213, 94, 0), (0, 158, 115))]
         seen.append((*runs, float((drawn.min(axis=-1) < 225).mean())))
     print(seen)
+    x, y, width, height = places[0]
+    shown = np.abs(pixels[y : y + height, x : x + width] - (237, 240, 242)).max(axis=-1) > 12  # of the 3D view, not its background
+    filled = [np.ptp(np.flatnonzero(shown.any(axis=axis))) / shown.shape[1 - axis] for axis in (0, 1)]
+    assert 0.85 < max(filled) < 0.95
     assert len(seen) == 4 and min(*seen[0][:2]) >= 3 and seen[0][2] > 0.04  # a path of two thirds of a second, and the wall behind
     assert min(*seen[1][:2]) >= 30 and min(*seen[2][:2], *seen[3][:2]) > 200

@@ -128,7 +128,7 @@ def test_the_convention_is_smfevals(tmp_path, capsys, convention):
 
 def test_other_formats_hold_no_covariances(tmp_path, capsys):
     assert main(["export", str(tmp_path), "--to", "kitti", "--covariance"]) == 2
-    message = "trihedron: export: the format 'kitti' holds no covariances; give --to tum, or leave out --covariance\n"
+    message = "trihedron: export: --covariance is not for the format 'kitti'; give --to tum, or leave out --covariance\n"
     assert capsys.readouterr().err == message and not list(tmp_path.iterdir())
 
 

@@ -5,6 +5,7 @@ import os
 from dataclasses import replace
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 import trimesh
@@ -103,15 +104,65 @@ def corner(island_m=0.1):
 def test_the_picture_shows_the_room_without_its_ceiling_and_without_islands():
     picture, count = export_picture.draw_surface(corner(), (320, 200))
     assert picture.shape == (200, 320, 3) and count == 6  # floor and walls
-    half = picture[:, 160:] if (picture[100, 157:163] == 255).all() else picture[100:]
-    drawn = (half != 255).any(axis=2)
+    drawn = (picture != 255).any(axis=2)
     filled = [np.ptp(np.flatnonzero(drawn.any(axis=axis))) / drawn.shape[1 - axis] for axis in (0, 1)]
     assert 0.85 < max(filled) < 0.95
-    colors, counts = np.unique(half.reshape(-1, 3), axis=0, return_counts=True)
+    colors, counts = np.unique(picture.reshape(-1, 3), axis=0, return_counts=True)
     flat = colors[np.argsort(-counts)[:4]].astype(int)  # paper and three planes
     assert min(np.abs(a - b).max() for i, a in enumerate(flat) for b in flat[:i]) > 25
     assert export_picture.draw_surface(corner(island_m=2.0), (32, 20))[1] == 8
     assert (export_picture.draw_surface(Surface.empty(0, 0))[0] == np.full((1200, 1920, 3), 255)).all()
+
+
+def flat_colors(surface):
+    """The colours of the picture that cover more than a twentieth of what is drawn, without light."""
+    picture, _ = export_picture.draw_surface(surface, (320, 200))
+    colors, counts = np.unique(picture[(picture != 255).any(axis=2)], axis=0, return_counts=True)
+    return {tuple(color) for color in colors[counts > 0.05 * counts.sum()]}
+
+
+def test_planes_that_continue_each_other_share_a_colour():
+    room = corner()
+    floor = np.array([0, -1, 0, 1.0])
+    halves = replace(room, instances=np.array([0, 4, 1, 1, 2, 2, 3, 3, -1, -1], np.int32), plane_ids=np.arange(5, dtype=np.int32),
+        coefficients=np.vstack([room.coefficients, floor]), kinds=np.append(room.kinds, np.uint8(1)),
+        areas_m2=np.append(room.areas_m2, np.float32(2)), plane_colors=np.zeros((5, 3), np.uint8))  # fmt: skip
+    assert len(flat_colors(room)) == len(flat_colors(halves)) == 3
+    step = np.vstack([[0, -1, 0, 1.05], halves.coefficients[1:]])
+    assert len(flat_colors(replace(halves, coefficients=step))) == 4
+
+
+def test_what_hangs_on_the_ceiling_alone_is_an_island():
+    room = corner()
+    count = len(room.vertices_m)
+    lamp = np.array([[1, 0, 1], [1.1, 0, 1], [1, 0.2, 1]], np.float32)
+    added = np.array([[count, count + 1, count + 2], [room.triangles[6, 0], count, count + 1]], np.int32)  # below the ceiling, and a part of it
+    hanging = replace(
+        room, vertices_m=np.vstack([room.vertices_m, lamp]), colors=np.zeros((count + 3, 3), np.uint8),
+        triangles=np.vstack([room.triangles, added]), instances=np.append(room.instances, np.array([-1, 3], np.int32)),
+        texels=np.full((12, 3, 2), np.nan, np.float32),
+    )  # fmt: skip
+    assert export_picture.draw_surface(hanging, (32, 20))[1] == 6
+
+
+def test_specks_of_the_picture_are_dropped():
+    drawn = np.zeros((40, 60), bool)
+    drawn[5:35, 5:35] = True
+    drawn[20, 50:53] = True
+    assert (export_picture.remove_specks(drawn) == (drawn & (np.arange(60) < 40))).all()
+
+
+def test_a_picture_has_the_colours_of_the_images_by_an_option(tmp_path, capsys):
+    run = recorded(tmp_path, corner())
+    for words, colors in ([], "planes"), (["--images"], "images"):
+        assert export.main([run, "--to", "png", *words]) == 0
+        expected = f"{tmp_path}/surface.png: 1920 × 1200 px, 6 triangles below the ceiling in the colours of the {colors}\n"
+        assert capsys.readouterr().out == expected
+    picture = cv2.imread(str(tmp_path / "surface.png"))[..., ::-1].astype(float)
+    drawn = picture[(picture != 255).any(axis=2)]
+    assert np.allclose(np.median(drawn / drawn[:, 2:], axis=0), (np.array([10, 20, 30]) / 30) ** 0.6, atol=0.02)  # lifted
+    with pytest.raises(UsageError, match="--images is not for the format 'ply'; give --to png, or leave out --images"):
+        export.main([run, "--to", "ply", "--images"])
 
 
 def test_planes_json_holds_identity_boundary_and_equation(tmp_path):
