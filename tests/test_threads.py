@@ -7,6 +7,8 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
+from hydra import initialize_config_module
+from hydra.core.global_hydra import GlobalHydra
 
 import trihedron as th
 from trihedron.datasets.simulation.synthetic import Synthetic
@@ -93,6 +95,15 @@ def test_configurations_are_composed_in_several_threads_at_once():
     with ThreadPoolExecutor(8) as pool:
         seeds = [config.seed for config in pool.map(lambda seed: compose_run([f"seed={seed}"]), range(16))]
     assert seeds == list(range(16))
+
+
+def test_a_program_may_use_hydra_itself():
+    """As `@hydra.main` does: its own configuration stays as it is."""
+    with initialize_config_module("trihedron.conf", version_base="1.3"):
+        before = GlobalHydra.instance().hydra
+        assert compose_run(["threads=1"]).threads == 1
+        assert GlobalHydra.instance().hydra is before is not None
+    assert not GlobalHydra.instance().is_initialized()
 
 
 def test_several_are_closed_in_any_order_and_twice(tmp_path):

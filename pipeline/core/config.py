@@ -9,13 +9,15 @@ from __future__ import annotations
 import dataclasses
 import re
 import threading
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from enum import Enum
 from importlib.resources import files
 from typing import Any
 
 from hydra import compose, initialize_config_module
 from hydra.core.config_store import ConfigStore
+from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import MissingConfigException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ValidationError
@@ -229,13 +231,26 @@ def compose_run(overrides: Iterable[str], recorded: RecordedConfig | None = None
 def composed_each(overrides: Iterable[Iterable[str]], recorded: RecordedConfig | None = None) -> list[DictConfig]:
     """Compose one configuration for each list of overrides; other threads wait. Raises TrihedronError, one line."""
     load_packages()
-    with _COMPOSING:
+    with _COMPOSING, _hydra_of_the_caller_set_aside():
         register_configs(recorded)
         try:
             with initialize_config_module("trihedron.conf", version_base="1.3"):
                 return [compose("root", overrides=with_literal_paths(words)) for words in overrides]
         except Exception as error:
             raise rewrite_error(error) from error
+
+
+@contextmanager
+def _hydra_of_the_caller_set_aside() -> Iterator[None]:
+    """Let the block initialise Hydra within a program that has done so itself (`@hydra.main`)."""
+    own = GlobalHydra.instance().hydra
+    GlobalHydra.instance().clear()
+    try:
+        yield
+    finally:
+        GlobalHydra.instance().clear()
+        if own is not None:
+            GlobalHydra.instance().initialize(own)
 
 
 def rewrite_error(error: Exception) -> TrihedronError:
