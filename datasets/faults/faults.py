@@ -79,6 +79,7 @@ class Faults:
     mirror: bool = False  # colour is mirrored left to right, depth is not
     join: NonNegativeInt = 0  # frame from which on the images are of another recording; 0 = none
     joined: dict[str, Any] = field(default_factory=dict)  # options of that where they differ: +dataset.joined.seed=1
+    depth_every: PositiveInt = 1  # only one depth image in so many is new, the next repeat it: 2 makes depth at 15 Hz of 30
 
     def __post_init__(self) -> None:
         if self.of == "faults" or "frames" in {**self.options, **self.joined}:
@@ -101,6 +102,8 @@ class Faults:
         if shown != number and self.frozen is not Covered.both:
             frozen = {"color": frame.color} if self.frozen is Covered.color else {"depth_m": frame.depth_m}
             shown, frame = number, replace(timed, **frozen)
+        if number % self.depth_every and (slow := self._inner(number - number % self.depth_every)) is not None:
+            frame = replace(frame, depth_m=slow.depth_m)
         color, depth, camera = self._cover_images(number, *self._spoilt(shown, frame))
         return Frame(arrived, self._delivery.stamp_ns(timed.stamp_ns, number), color, depth, camera)
 

@@ -56,6 +56,12 @@ def test_one_image_freezes_and_the_other_goes_on(frozen):
         assert np.array_equal(seen.depth_m, plain[position if frozen is Covered.color else still].depth_m)
 
 
+def test_depth_is_slower_than_color():
+    (plain, _), faults = still_frames(0, 6), Faults("0:6", "synthetic", SMALL, depth_every=3)
+    for position, fresh in enumerate((0, 0, 0, 3, 3, 3)):
+        assert np.array_equal(faults(position).color, plain[position].color) and np.array_equal(faults(position).depth_m, plain[fresh].depth_m)
+
+
 def test_color_is_mirrored_shuffled_or_random_and_depth_is_not():
     options = {**SMALL, "length": 12}
     plain = [Synthetic(width=64, height=48, motion=Motion.pan, length=12)(i) for i in range(12)]
