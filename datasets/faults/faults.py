@@ -46,7 +46,7 @@ class Faults:
     """The data set `of` as a bad day would deliver it. Frames are numbered as they arrive; ranges are of the numbers in the data set underneath.
     What is random depends on the seed and the frame alone."""
 
-    frames: Frames = ""  # part to read, half open: A:B, A:, :B; empty = all
+    frames: Frames = ""  # part to read, half open: A:B, A:, :B, every S-th A:B:S; empty = all
     of: str = "synthetic"  # the data set underneath
     options: dict[str, Any] = field(default_factory=dict)  # its options: +dataset.options.path=FOLDER
     cover: Frames = ""  # frames A:B for which the camera is covered; empty = never
@@ -87,12 +87,11 @@ class Faults:
         _ = self._inner  # whose options are refused now when they are out of range
 
     def __len__(self) -> int:
-        first, stop = self._range
-        return stop - first
+        return len(self._range)
 
     def __call__(self, index: int) -> Frame | None:
         """Frame `index` of the selection. Raises DataError where depth and colour differ in size."""
-        arrived = self._range[0] + index
+        arrived = self._range[index]
         number = int(self._delivered_frames[arrived])
         shown = self._delivery.source_frame(number)
         frame: Frame | None = self._inner(shown)
@@ -182,7 +181,7 @@ class Faults:
         return self._delivery.frame_numbers(len(self._inner), self.seed)
 
     @cached_property
-    def _range(self) -> tuple[int, int]:
+    def _range(self) -> range:
         return clip_range(self.frames, len(self._delivered_frames), f"the {self.of} data set, as far as they are delivered")
 
     @cached_property

@@ -46,6 +46,8 @@ def test_frames_is_a_half_open_range_of_the_whole_data_set(tum_folder: Path, cap
     frames = [dataset(0), dataset(1)]
     assert len(dataset) == 2
     assert [(f.index, f.stamp_ns) for f in frames if f] == [(1, 10_100_000_000), (2, 10_200_000_000)]
+    strided = Tum(path=str(tum_folder), frames="1::2")
+    assert [(f.index, f.stamp_ns) for f in map(strided, range(len(strided))) if f] == [(1, 10_100_000_000), (3, 10_300_000_000)]
     assert len(Tum(path=str(tum_folder), frames=":2")) == 2
     with caplog.at_level(logging.WARNING, logger="trihedron"):
         assert len(Tum(path=str(tum_folder), frames="2:9")) == 2
