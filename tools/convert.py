@@ -31,7 +31,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("destination", metavar="DST.mcap", type=Path)
     parser.add_argument("--dataset", metavar="NAME", help="the layout, when it is not recognised: tum, icl_nuim, folder, ...")
     parser.add_argument("--camera", metavar="PRESET|FILE", help="as dataset.camera of trihedron run")
-    parser.add_argument("--frames", metavar="A:B", default="", help="only this half-open range of frames")
+    parser.add_argument("--frames", metavar="A:B[:S]", default="", help="only this half-open range of frames, or every S-th of it")
     parser.add_argument("--overwrite", action="store_true", help="replace DST.mcap if it exists")
     arguments = parser.parse_args(argv)
     destination: Path = arguments.destination

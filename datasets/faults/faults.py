@@ -46,7 +46,7 @@ class Faults:
     """The data set `of` as a bad day would deliver it. Frames are numbered as they arrive; ranges are of the numbers in the data set underneath.
     What is random depends on the seed and the frame alone."""
 
-    frames: Frames = ""  # part to read, half open: A:B, A:, :B; empty = all
+    frames: Frames = ""  # part to read, half open: A:B, A:, :B, every S-th A:B:S; empty = all
     of: str = "synthetic"  # the data set underneath
     options: dict[str, Any] = field(default_factory=dict)  # its options: +dataset.options.path=FOLDER
     cover: Frames = ""  # frames A:B for which the camera is covered; empty = never
@@ -79,6 +79,7 @@ class Faults:
     mirror: bool = False  # colour is mirrored left to right, depth is not
     join: NonNegativeInt = 0  # frame from which on the images are of another recording; 0 = none
     joined: dict[str, Any] = field(default_factory=dict)  # options of that where they differ: +dataset.joined.seed=1
+    depth_every: PositiveInt = 1  # only one depth image in so many is new, the next repeat it: 2 makes depth at 15 Hz of 30
 
     def __post_init__(self) -> None:
         if self.of == "faults" or "frames" in {**self.options, **self.joined}:
@@ -86,12 +87,11 @@ class Faults:
         _ = self._inner  # whose options are refused now when they are out of range
 
     def __len__(self) -> int:
-        first, stop = self._range
-        return stop - first
+        return len(self._range)
 
     def __call__(self, index: int) -> Frame | None:
         """Frame `index` of the selection. Raises DataError where depth and colour differ in size."""
-        arrived = self._range[0] + index
+        arrived = self._range[index]
         number = int(self._delivered_frames[arrived])
         shown = self._delivery.source_frame(number)
         frame: Frame | None = self._inner(shown)
@@ -101,6 +101,8 @@ class Faults:
         if shown != number and self.frozen is not Covered.both:
             frozen = {"color": frame.color} if self.frozen is Covered.color else {"depth_m": frame.depth_m}
             shown, frame = number, replace(timed, **frozen)
+        if number % self.depth_every and (slow := self._inner(number - number % self.depth_every)) is not None:
+            frame = replace(frame, depth_m=slow.depth_m)
         color, depth, camera = self._cover_images(number, *self._spoilt(shown, frame))
         return Frame(arrived, self._delivery.stamp_ns(timed.stamp_ns, number), color, depth, camera)
 
@@ -179,7 +181,7 @@ class Faults:
         return self._delivery.frame_numbers(len(self._inner), self.seed)
 
     @cached_property
-    def _range(self) -> tuple[int, int]:
+    def _range(self) -> range:
         return clip_range(self.frames, len(self._delivered_frames), f"the {self.of} data set, as far as they are delivered")
 
     @cached_property

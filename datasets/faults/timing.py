@@ -36,7 +36,7 @@ class Delivery:
 
     def source_frame(self, number: int) -> int:
         """The frame whose images arrive as those of frame `number`: another one while the camera is frozen."""
-        return frame_range(self.freeze)[0] if bool(inside(self.freeze, np.array([number]))[0]) else number
+        return frame_range(self.freeze).start if bool(inside(self.freeze, np.array([number]))[0]) else number
 
     def stamp_ns(self, stamp_ns: int, number: int) -> int:
         """Return the reading of the faulty clock at `stamp_ns`."""
@@ -44,8 +44,8 @@ class Delivery:
 
 
 def inside(frames: str, numbers: Numbers) -> NDArray[np.bool_]:
-    """(n,) whether frame numbers lie in the range A:B; none does where it is empty."""
+    """(n,) whether frame numbers lie in the range A:B or A:B:S; none does where it is empty."""
     if not frames:
         return np.zeros(len(numbers), bool)
-    first, stop = frame_range(frames)
-    return (numbers >= first) & (numbers < (np.iinfo(np.int64).max if stop is None else stop))
+    chosen = frame_range(frames)
+    return np.asarray((numbers >= chosen.start) & (numbers < chosen.stop) & ((numbers - chosen.start) % chosen.step == 0))

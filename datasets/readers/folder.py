@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from dataclasses import dataclass
 from itertools import pairwise
@@ -25,6 +26,7 @@ SECONDS = re.compile(r"\d+\.\d+")
 EPOCH_NS = {13: 1_000_000, 16: 1_000, 19: 1}  # digits of a name that counts ms, µs or ns since 1970 -> ns of one unit
 MAX_NAME = 32  # digits of a name that is a number
 LAST_NS = 2**62  # of a stamp
+log = logging.getLogger("trihedron")
 
 
 @register("dataset", "folder")
@@ -85,7 +87,21 @@ def _pair(folder: Path, colors: list[Path], depths: list[Path], max_difference_n
     if len(colors) != len(depths):
         cause = f"{len(colors)} colour and {len(depths)} depth images have no name in common"
         raise DataError(str(folder), cause, "give the two images of a pair the same name")
+    _warn_of_times(folder, names, [file.stem for file in depths])
     return names, colors, depths
+
+
+def _warn_of_times(folder: Path, colors: list[str], depths: list[str]) -> None:
+    """Warn where images that are paired by their order have names that are times, most of them more than half a frame apart."""
+    if len(colors) < 2 or not all(SECONDS.fullmatch(name) or (name.isdecimal() and len(name) in EPOCH_NS) for name in colors + depths):
+        return
+    color_ns = _stamps(colors, 1.0)
+    apart_ns = np.abs(color_ns - _stamps(depths, 1.0))
+    count = int(np.count_nonzero(apart_ns > 0.5 * np.median(np.diff(color_ns))))
+    if 2 * count > len(colors):
+        cause = "%s: by their names the colour and depth of %d of %d frames are more than half a frame apart, by %.1f ms (median); "
+        cure = "remove images without a partner, and give the two of a pair the same name"
+        log.warning(cause + cure, folder, count, len(colors), float(np.median(apart_ns)) / 1e6)
 
 
 def _numbers(files: list[Path]) -> dict[int, Path]:

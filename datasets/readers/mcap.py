@@ -36,7 +36,7 @@ class McapDataset:
     whole. Raises DataError when the file holds no frames, RecordingError when it is missing, damaged or not MCAP."""
 
     path: str = ""  # FILE.mcap, FILE.bag of ROS 1, or the folder of a rosbag2
-    frames: Frames = ""  # half-open range of frame numbers "A:B"
+    frames: Frames = ""  # half-open range of frame numbers: A:B, A:, :B, every S-th A:B:S; empty = all
     color_topic: str = ""  # of a robot's recording; empty = the only one with colour images
     depth_topic: str = ""  # empty = the only one with depth images
     color_info_topic: str = ""  # intrinsics; empty = those beside the images, else of the same coordinate frame
@@ -59,18 +59,17 @@ class McapDataset:
         return RobotRecording(file, topics, round(self.max_difference_ms * 1e6), round(self.depth_delay_ms * 1e6), self.depth_scale)
 
     @cached_property
-    def _range(self) -> tuple[int, int]:
+    def _range(self) -> range:
         return clip_range(self.frames, len(self._frames), self.path)
 
     def __len__(self) -> int:
         with one_line_errors(self.path):
-            first, stop = self._range
-        return stop - first
+            return len(self._range)
 
     def __call__(self, index: int) -> Frame | None:
         """Read frame `index` of the selection, or None, after a warning, where it cannot be read."""
         with one_line_errors(self.path):
-            return self._frames.frame(self._range[0] + index)
+            return self._frames.frame(self._range[index])
 
     def truth(self) -> Trajectory | None:
         """Return the attached ground truth, or that of `truth_from`."""

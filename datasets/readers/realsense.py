@@ -44,12 +44,12 @@ class RealSense:
     fps: PositiveInt = 30
 
     def __post_init__(self) -> None:
-        if frame_range(self.frames)[0] != 0:
-            raise ValueError("frames: a camera begins with frame 0")
+        chosen = frame_range(self.frames)
+        if chosen.start != 0 or chosen.step != 1:
+            raise ValueError("frames: a camera begins with frame 0, and gives every frame")
 
     def __len__(self) -> int:
-        stop = frame_range(self.frames)[1]
-        return ENDLESS if stop is None else stop
+        return min(frame_range(self.frames).stop, ENDLESS)
 
     def start(self) -> None:
         """Begin with frame 0. Raises LibraryError without the maker's library, DataError without the camera."""

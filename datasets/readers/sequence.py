@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -37,7 +38,7 @@ DepthReader = Callable[[Path], F32]
 
 @dataclass(frozen=True)
 class ImageSequence:
-    """Pairs of files with their stamps, read as frames. `first` is the number of the first pair in the whole data set;
+    """Pairs of files with their stamps, read as frames. `numbers` are those of the pairs in the whole data set;
     `depth_reader` replaces the reading of 16-bit images, `color_reader` that of colour. Frames are not cached: memory does not grow with
     the sequence."""
 
@@ -46,7 +47,7 @@ class ImageSequence:
     depth_files: Sequence[Path]
     calibration: Calibration
     truth: Trajectory | None = None
-    first: int = 0
+    numbers: range = range(sys.maxsize)
     depth_reader: DepthReader | None = None
     color_reader: Callable[[Path], U8] = read_color
 
@@ -59,11 +60,11 @@ class ImageSequence:
             color = self._read(self.color_files[position], self.color_reader)
             depth = self._read(self.depth_files[position], self.depth_reader or self._read_depth)
         except UnreadableImage as error:
-            log.warning("%s; frame %d is skipped", error, self.first + position)
+            log.warning("%s; frame %d is skipped", error, self.numbers[position])
             return None
         self._check_sizes(position, color, depth)
         color, depth = self.calibration.rectification.color(color), self.calibration.rectification.depth(depth)
-        return Frame(self.first + position, int(self.stamps_ns[position]), color, depth, self.calibration.camera)
+        return Frame(self.numbers[position], int(self.stamps_ns[position]), color, depth, self.calibration.camera)
 
     def _read(self, path: Path, reader: Callable[[Path], Any]) -> Any:
         try:
@@ -86,7 +87,7 @@ class SequenceReader(ABC):
     """A folder that is an ImageSequence: what its readers share. Frames are numbered as in the whole data set."""
 
     path: str = ""  # folder of the sequence
-    frames: Frames = ""  # part to read, half open: A:B, A:, :B; empty = all
+    frames: Frames = ""  # part to read, half open: A:B, A:, :B, every S-th A:B:S; empty = all
 
     @abstractmethod
     def _open(self, folder: Path) -> ImageSequence:
@@ -151,23 +152,23 @@ def first_size(files: list[Path], depth_scale: float) -> tuple[int, int]:
 
 
 def select_frames(sequence: ImageSequence, frames: str, place: str) -> ImageSequence:
-    """The half-open part `frames` ("A:B") of a whole sequence; B beyond the end means the end. Raises DataError when A is beyond it."""
-    begin, end = clip_range(frames, len(sequence), place)
-    part = slice(begin, end)
+    """The half-open part `frames` ("A:B" or "A:B:S") of a whole sequence; B beyond the end means the end. Raises DataError when A is beyond it."""
+    numbers = clip_range(frames, len(sequence), place)
+    part = slice(numbers.start, numbers.stop, numbers.step)
     return replace(
         sequence,
         stamps_ns=sequence.stamps_ns[part],
         color_files=sequence.color_files[part],
         depth_files=sequence.depth_files[part],
-        first=begin,
+        numbers=numbers,
     )
 
 
-def clip_range(frames: str, count: int, place: str) -> tuple[int, int]:
-    """Start and stop of the field `frames` in a data set of `count` frames. Raises DataError when nothing is left."""
-    begin, end = frame_range(frames)
-    if begin >= count:
+def clip_range(frames: str, count: int, place: str) -> range:
+    """The numbers of the frames that the field `frames` chooses of a data set of `count`. Raises DataError when none is left."""
+    chosen = frame_range(frames)
+    if chosen.start >= count:
         raise DataError("dataset.frames", f"'{frames}' begins beyond the {count} frames of {place}", f"give a range within 0:{count}")
-    if end is not None and end > count:
+    if count < chosen.stop < sys.maxsize:
         log.warning("dataset.frames: '%s' ends beyond the %d frames of %s", frames, count, place)
-    return begin, min(count, count if end is None else end)
+    return range(chosen.start, min(count, chosen.stop), chosen.step)

@@ -33,7 +33,7 @@ class SimulatedSensor:
     registration and intrinsics. The stated camera has the kind's nominal intrinsics and a Kinect's depth noise, as a folder without calibration has.
     Stamps and truth are of the middle row of colour. Frame i depends on the fields and i alone."""
 
-    frames: Frames = ""  # part to make, half open: A:B, A:, :B; empty = all
+    frames: Frames = ""  # part to make, half open: A:B, A:, :B, every S-th A:B:S; empty = all
     sensor: Sensor = Sensor.kinect_v1  # kinect_v1 | tof | realsense_stereo | hololens | phone
     sensor_seed: NonNegativeInt = 0  # of the hidden parameters
     scene: Scene = Scene.room  # room | corridor | offices | rooms | flat | slanted_flat
@@ -51,12 +51,11 @@ class SimulatedSensor:
         _ = self._world  # whose options are refused now
 
     def __len__(self) -> int:
-        first, stop = self._range
-        return stop - first
+        return len(self._range)
 
     def __call__(self, index: int) -> Frame | None:
         """Frame `index` of the selection."""
-        number = self._range[0] + index
+        number = self._range[index]
         time_s, rng = number / self._rate, np.random.default_rng([self.seed, self.sensor_seed, 8, number])
         color, depth = self._color(time_s, rng), self._depth(time_s, rng)
         return Frame(number, self._stamp_ns(number), color, depth, self.camera)
@@ -164,5 +163,5 @@ class SimulatedSensor:
         )  # fmt: skip
 
     @cached_property
-    def _range(self) -> tuple[int, int]:
+    def _range(self) -> range:
         return clip_range(self.frames, self._length, f"the simulated {self.sensor.name} (dataset.length)")

@@ -59,7 +59,7 @@ FOCAL_PER_WIDTH = 525.0 / 640.0  # a Kinect's nominal colour camera
 class Synthetic:
     """A furnished room of 5 × 4 × 2.7 m, or a building, ray traced when a frame is asked for. Frame i depends on the fields and i alone."""
 
-    frames: Frames = ""  # part to make, half open: A:B, A:, :B; empty = all
+    frames: Frames = ""  # part to make, half open: A:B, A:, :B, every S-th A:B:S; empty = all
     scene: Scene = Scene.room  # room | corridor | offices | rooms | flat | slanted_flat | house
     length: NonNegativeInt = 0  # frames; 0 = the scene's own: 150 of the room, once round a building (a longer walk goes on)
     fps: PositiveFloat = 30.0
@@ -82,12 +82,11 @@ class Synthetic:
             raise ValueError("curved: only the room has these pieces")
 
     def __len__(self) -> int:
-        first, stop = self._range
-        return stop - first
+        return len(self._range)
 
     def __call__(self, index: int) -> Frame | None:
         """Frame `index` of the selection."""
-        number = self._range[0] + index
+        number = self._range[index]
         geometry, atlas = self._scene
         color, exact, _, cosine = render(geometry, atlas, self._camera, self._pose(number))
         depth = exact.astype(np.float32)
@@ -113,14 +112,14 @@ class Synthetic:
     def true_view(self, index: int) -> tuple[F64, Bool]:
         """(h, w) exact depth in metres of frame `index` of the selection, and (h, w) whether what is seen there is curved."""
         geometry, atlas = self._scene
-        _, depth, faces, _ = render(geometry, atlas, self._camera, self._pose(self._range[0] + index))
+        _, depth, faces, _ = render(geometry, atlas, self._camera, self._pose(self._range[index]))
         return depth, np.array([face.curved != BOX for face in all_faces(self._room)])[faces]
 
     def true_planes(self, index: int) -> tuple[F64, I32, F64]:
         """(h, w) exact depth in metres of frame `index` of the selection, (h, w) the plane that each pixel shows, -1 where it is curved, and (k, 4)
         these planes in the camera frame, `d >= 0`. Faces that are coplanar are one plane."""
         geometry, atlas = self._scene
-        T_world_camera = self._pose(self._range[0] + index)
+        T_world_camera = self._pose(self._range[index])
         _, depth, faces, _ = render(geometry, atlas, self._camera, T_world_camera)
         known = all_faces(self._room)
         world = np.array([[*face.normal, matmul(-face.normal, face.origin)] for face in known])
@@ -131,7 +130,7 @@ class Synthetic:
 
     def true_pose(self, index: int) -> F64:
         """(4, 4) exact `T_world_camera` of frame `index` of the selection, in the frame of `truth`."""
-        return self._pose(self._range[0] + index)
+        return self._pose(self._range[index])
 
     def pose_at(self, time_s: float) -> F64:
         """(4, 4) exact `T_world_camera` at a time in seconds; frame i is at i / fps."""
@@ -160,7 +159,7 @@ class Synthetic:
         return self.length or natural
 
     @cached_property
-    def _range(self) -> tuple[int, int]:
+    def _range(self) -> range:
         return clip_range(self.frames, self._length, f"the synthetic {self.scene.name} (dataset.length)")
 
     @cached_property

@@ -48,7 +48,7 @@ Usage: trihedron run [-m] [key=value ...]
   FOLDER | FILE.mcap | FILE.bag      what to track; the data set is known by its files, else: dataset=NAME dataset.path=FOLDER
                                      a relative path begins in the working folder; nothing else is searched
   dataset=NAME                       {datasets}
-  dataset.frames=A:B                 half-open range of frames       dataset.camera=PRESET|FILE  the camera
+  dataset.frames=A:B, A:B:S          half-open range; every S-th of it  dataset.camera=PRESET|FILE  the camera
   graph=NAME                         {graphs}
   without=PART                       {without}
   experiment=NAME (with -m)          {experiments}

@@ -24,6 +24,7 @@ from trihedron.pipeline.core.config import Feedback, graph_of
 from trihedron.pipeline.core.errors import ConfigError, DataError, LibraryError, RecordingError, did_you_mean, printable
 from trihedron.pipeline.core.files import sha256_of
 from trihedron.pipeline.core.graph import Graph
+from trihedron.pipeline.core.options import frame_range
 from trihedron.pipeline.core.overrides import literal_text, path_of, quote
 from trihedron.pipeline.core.registry import write_files_of
 from trihedron.pipeline.core.slots import SLOTS, output_of
@@ -151,8 +152,13 @@ def remembered_of(config: DictConfig, graph: Graph) -> Callable[[int], DelayLine
         return None
     if "map" not in max_delays(graph.stages.values()):
         raise ConfigError("load_map", "no stage of this graph reads a map", "choose another graph")
-    saved, source = load_map(config.load_map), source_of(config)
-    return lambda first: saved.delay_lines(first, source)
+    saved, source, stride = load_map(config.load_map), source_of(config), _frames_of(config).step
+    return lambda first: saved.delay_lines(first, stride, source)
+
+
+def _frames_of(config: DictConfig) -> range:
+    """The numbers of the frames that a run takes of its data set."""
+    return frame_range(str(config.dataset.get("frames", "")) if config.dataset is not None else "")
 
 
 def _pace(config: DictConfig) -> Pace:
@@ -164,9 +170,10 @@ def _pace(config: DictConfig) -> Pace:
 
 
 def source_of(config: DictConfig) -> str:
-    """Data set that is tracked, whichever part of it: its options with absolute paths."""
+    """Data set that is tracked, whichever part of it: its options with absolute paths, and the stride where not every frame is."""
     options: Any = OmegaConf.to_container(config.dataset, resolve=True, enum_to_str=True) if config.dataset is not None else {}
     options = {name: _absolute(value) if f"dataset.{name}" in READ_PATHS else str(value) for name, value in options.items() if name != "frames"}
+    options |= {"stride": step} if (step := _frames_of(config).step) > 1 else {}
     return json.dumps(options, sort_keys=True)
 
 

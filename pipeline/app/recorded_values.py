@@ -17,6 +17,7 @@ from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.rescue import recover
 from trihedron.pipeline.run.accounting import Result
 from trihedron.pipeline.run.poses import Poses
+from trihedron.pipeline.run.replay import at_rate
 from trihedron.pipeline.run.results import final_trajectory
 
 
@@ -74,10 +75,15 @@ def frames_of(recording: Recording) -> Callable[[FrameReference], Frame | None]:
 
         return embedded_frame
     options = composed_run(recording).dataset
-    dataset, first = make_plugin("dataset", options), frame_range(str(options.get("frames", "")))[0]
+    dataset, numbers = make_plugin("dataset", options), frame_range(str(options.get("frames", "")))
     try:
         len(dataset)
     except DataError as error:
         cause = f"does not embed its frames, and the data set is gone ({error.place}: {error.cause})"
         raise DataError(str(recording.path), cause, "record with record.frames=true") from error
-    return lambda reference: dataset(reference.index - first)
+
+    def dataset_frame(reference: FrameReference) -> Frame | None:
+        frame: Frame | None = dataset(numbers.index(reference.index))
+        return frame if frame is None else at_rate(frame, reference.camera.fps)
+
+    return dataset_frame

@@ -9,6 +9,7 @@
 from __future__ import annotations
 
 import re
+import sys
 from abc import abstractmethod
 from contextlib import suppress
 from dataclasses import dataclass, fields
@@ -69,12 +70,14 @@ class OneOf(Constraint):
         return "one of " + ", ".join(map(str, self.choices))
 
 
-def frame_range(text: str) -> tuple[int, int | None]:
-    """Parse a half-open range of frames: "A:B", "A:", ":B" or "" for all -> (start, stop or None). Raises ValueError."""
-    match = re.fullmatch(r"\s*(\d*)\s*:\s*(\d*)\s*", text or ":")
-    if not match or (match[1] and match[2] and int(match[1]) >= int(match[2])):
-        raise ValueError(f"frames: '{text}' is not a range of frames A:B with A < B")
-    return int(match[1] or 0), int(match[2]) if match[2] else None
+def frame_range(text: str) -> range:
+    """Parse a half-open range of frames: "A:B", "A:", ":B" or "" for all, and "A:B:S" for every S-th of them -> their numbers in the data set, which
+    go on to `sys.maxsize` where no end is given. Raises ValueError."""
+    match = re.fullmatch(r"\s*(\d*)\s*:\s*(\d*)\s*(?::\s*(\d*)\s*)?", text or ":")
+    start, stop, step = (int(given or default) for given, default in zip(match.groups(), (0, sys.maxsize, 1), strict=True)) if match else (0, 0, 0)
+    if start >= stop or step < 1:
+        raise ValueError(f"frames: '{text}' is not {FrameRange()}")
+    return range(start, stop, step)
 
 
 @dataclass(frozen=True)
@@ -89,7 +92,7 @@ class FrameRange(Constraint):
         return False
 
     def __str__(self) -> str:
-        return "a range of frames A:B with A < B"
+        return "a range of frames A:B[:S] with A < B, S > 0"
 
 
 Frames = Annotated[str, FrameRange()]

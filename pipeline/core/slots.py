@@ -56,7 +56,8 @@ class Dataset(Protocol):
 
     `__call__(index)` returns frame `index` (0 <= index < len), or None where it cannot be read, after a warning on the logger `trihedron`.
     Stamps increase strictly with the index. Constructing it is cheap; `len` opens the folder and raises DataError when it cannot be used.
-    A frame's own `index` is its number in the whole data set: position plus the start of the field `frames` ("A:B", see `frame_range`).
+    A frame's own `index` is its number in the whole data set, `frame_range(frames)[index]` of the field `frames` ("A:B" or "A:B:S"). Its camera has
+    the rate of the whole data set; a run over every S-th frame divides it by S.
     `truth` is the ground truth `T_world_camera` as the data set gives it (any rate, any subset of the frames), or None."""
 
     def __len__(self) -> int: ...

@@ -19,6 +19,7 @@ LATE_NS = 1_000_000_000  # a frame that comes this late or later was not late: t
 CONSTANT = 0.95  # share of the readings with one value, from which an image of depth counts as constant
 CONSTANT_READINGS = 0.01  # of the image, without which nothing is constant
 STALE_NS = 50_000_000  # age from which a repeated image is wrong: a Kinect repeats single images at 30 a second
+RATE_IMAGES = 4  # in a row that each repeat equally often, which shows a slower stream: a Kinect repeats single images here and there
 CHANGED_LEVELS, CHANGED_SIGMAS = 16, 7.0  # grey levels, and standard deviations of depth, beyond the noise of an image
 CHANGED_SHARE = 0.02  # of the pixels, by which an image has changed
 SATURATED, CROWDED = 0.02, 3.0  # a limit: share of the image that has this value, and times the readings of any other depth
@@ -91,23 +92,50 @@ def constant_share(depth_m: F32) -> float:
 
 
 class FrozenStream:
-    """Detects one stream, depth or colour, that stands still, bit-identical frame after frame, while the other goes on.
+    """Detects one stream, depth or colour, that stands still, bit-identical frame after frame, while the other goes on; and one that is slower.
 
     The other is compared with that of the first frame with this image: the change adds up while the camera moves. A camera at rest shows no change
-    beyond its noise. An image that is repeated for less than `STALE_NS` is late, not a fault."""
+    beyond its noise. An image that is repeated for less than `STALE_NS` is late, not a fault, unless all are repeated equally often.
+
+    `period` is the number of frames from one new image to the next where that is regular, 1 before it is known to be; `undecided` while nothing but
+    repeated images came, too few to know."""
 
     def __init__(self, image: Callable[[Frame], F32 | U8], has_moved: Callable[[Frame, Frame], bool]) -> None:
         self._image, self._has_moved = image, has_moved
         self._first: Frame | None = None
+        self._length, self._moved = 0, False  # frames with the present image, and whether the other has changed meanwhile
+        self._lengths: list[int] = []  # of the images before it, the first of all left out, whose beginning was not seen
+        self._images = 0
+        self.period, self.undecided = 1, True
 
     def since(self, frame: Frame) -> int | None:
         """Return the number of the first frame with the image of this one, if that is stale and the other image has changed since; else None."""
         first = self._first
         if first is None or not _bit_identical(self._image(first), self._image(frame)):
-            self._first = frame
+            self._count_image()
+            self._first, self._length, self._moved = frame, 1, False
             return None
-        stale = frame.stamp_ns - first.stamp_ns >= STALE_NS and bool(self._image(frame).any())
-        return first.index if stale and self._has_moved(first, frame) else None
+        self._length += 1
+        age_ns = frame.stamp_ns - first.stamp_ns
+        self.undecided = self.undecided and age_ns < LATE_NS
+        moved = bool(self._image(frame).any()) and self._has_moved(first, frame)
+        self._moved |= moved
+        return first.index if moved and (age_ns >= STALE_NS or self.period > 1) else None
+
+    def known_rate(self) -> bool:
+        """Return True where the stream is known to be slower and the present image is repeated no longer than that and a missed one explain."""
+        return self.period > 1 and self._length <= 2 * self.period
+
+    def _count_image(self) -> None:
+        """Count how often an image came, when the next comes. One that is repeated while nothing changes tells nothing."""
+        self._images += self._first is not None
+        if self.period > 1 or self._images < 2 or (self._length > 1 and not self._moved):
+            return
+        self._lengths = [*self._lengths, self._length][-RATE_IMAGES:]
+        regular = len(set(self._lengths)) == 1
+        if regular and self._length > 1 and len(self._lengths) == RATE_IMAGES:
+            self.period = self._length
+        self.undecided = self.undecided and regular and self._length > 1 and self.period == 1
 
 
 def color_has_changed(a: Frame, b: Frame) -> bool:
@@ -144,6 +172,8 @@ class FrameValidation:
         self._gaps: list[float] = []
         self._frozen_depth = FrozenStream(lambda frame: frame.depth_m, color_has_changed)
         self._frozen_color = FrozenStream(lambda frame: frame.color, depth_has_changed)
+        self._depth_is_slower = False
+        self._frozen: list[tuple[int, int]] = []  # frames with depth that is not new, and whose it is: to be warned of unless it is the rate of depth
         self._registration = RegistrationCheck()
         self.late: set[int] = set()
 
@@ -162,21 +192,43 @@ class FrameValidation:
         if not isinstance(frame, Frame):
             return frame
         timed = self._in_time(position, frame)
-        valid = self._without_faulty_depth(self._without_frozen_color(usable(timed))) if timed is not None else None
+        valid = self._without_faulty_depth(position, self._without_frozen_color(usable(timed))) if timed is not None else None
         return without_limit(valid, lambda fps: self._elsewhere(position, read, fps))
 
-    def _without_faulty_depth(self, frame: Frame | None) -> Frame | None:
+    def _without_faulty_depth(self, position: int, frame: Frame | None) -> Frame | None:
         """Return the frame without its depth where that is constant (saturated, for one) or frozen: whatever is tracked by it is wrong."""
         if frame is None:
             return None
         since, constant = self._frozen_depth.since(frame), constant_share(frame.depth_m)
+        self._judge_depth_rate(frame)
         if since is not None:
-            log.warning("frame %d: its depth is that of frame %d, bit for bit, while colour has changed; it counts as missing", frame.index, since)
+            if not self._frozen_depth.known_rate():
+                self._frozen.append((frame.index, since))
         elif constant >= CONSTANT:
             log.warning("frame %d: %.0f %% of its depth readings are equal; they count as missing", frame.index, 100 * constant)
-        else:
+        if not self._frozen_depth.undecided or position + 1 == self._count:
+            self._warn_of_frozen_depth()
+        if since is None and constant < CONSTANT:
             return frame
         return replace(frame, depth_m=np.zeros_like(frame.depth_m))
+
+    def _warn_of_frozen_depth(self) -> None:
+        for index, since in self._frozen:
+            log.warning("frame %d: its depth is that of frame %d, bit for bit, while colour has changed; it counts as missing", index, since)
+        self._frozen.clear()
+
+    def _judge_depth_rate(self, frame: Frame) -> None:
+        """Warn, once, where depth is slower than colour; what was about to be called frozen for that is not."""
+        period, fps = self._frozen_depth.period, frame.camera.fps
+        if period == 1 or self._depth_is_slower:
+            return
+        self._depth_is_slower = True
+        self._frozen.clear()
+        log.warning(
+            "depth is slower than colour, about %.3g Hz instead of %.3g: only every %s depth image is new, a repeated one counts as missing; "
+            "record depth at the rate of colour, or take the frames with new depth alone: dataset.frames=%d::%d",
+            *(fps / period, fps, {2: "second", 3: "third"}.get(period, f"{period}th"), frame.index % period, period),
+        )
 
     def _without_frozen_color(self, frame: Frame | None) -> Frame | None:
         """Return the frame with black colour where that is frozen: the depth behind its key points is not theirs."""

@@ -73,27 +73,31 @@ class Playback:
 
 
 class Feed:
-    """The frames that a run takes from a live source, in order: `numbers` of those taken so far (from 0), and the time each came."""
+    """The frames that a run takes from a live source, in order: `numbers` in the data set of those taken so far, and the time each came. `requested`
+    are the numbers of all that may come."""
 
-    def __init__(self, camera: Camera) -> None:
-        self._camera = camera
+    def __init__(self, camera: Camera, requested: range) -> None:
+        self._camera, self._requested = camera, requested
+        self._latest = -1  # of those that came, counted from 0
         self.numbers: list[int] = []
         self.came_s: list[float] = []
 
     def start(self) -> None:
         """Begin with frame 0."""
         self._camera.start()
+        self._latest = -1
         self.numbers.clear()
         self.came_s.clear()
 
     def take(self) -> int | None:
         """Wait for the next frame and return its number; None when no more will come."""
-        arrival = self._camera.wait(self.numbers[-1] if self.numbers else -1)
+        arrival = self._camera.wait(self._latest)
         if arrival is None:
             return None
-        self.numbers.append(arrival.number)
+        self._latest = arrival.number
+        self.numbers.append(self._requested[arrival.number])
         self.came_s.append(arrival.at_s)
-        return arrival.number
+        return self.numbers[-1]
 
     def stop(self) -> None:
         """Stop the source."""
@@ -101,7 +105,7 @@ class Feed:
 
     def summary(self, latency_ms: dict[str, float]) -> dict[str, Any]:
         """Return the numbers of frames that came during the run, were taken and were dropped, and the latency of their poses."""
-        came = self.numbers[-1] + 1 if self.numbers else 0
+        came = self._latest + 1
         return {"came": came, "taken": len(self.numbers), "dropped": came - len(self.numbers), "latency_ms": latency_ms}
 
 
@@ -116,14 +120,14 @@ def shows_once(dataset: Any) -> bool:
     return is_camera(dataset) and bool(getattr(dataset, "embedded", True))
 
 
-def feed_of(dataset: Any, pace: Pace) -> Feed | None:
-    """Return the feed of a live source, or of a data set played as one; None where frames can be read at any time. Raises DataError where no frame
-    can be read, which has the rate."""
+def feed_of(dataset: Any, pace: Pace, requested: range) -> Feed | None:
+    """Return the feed of a live source, or of the `requested` frames of a data set, played as one; None where frames can be read at any time. Raises
+    DataError where no frame can be read, which has the rate."""
     if is_camera(dataset):
-        return Feed(dataset)
+        return Feed(dataset, requested)
     if pace is Pace.none:
         return None
     first = next((frame for frame in map(dataset, range(len(dataset))) if frame is not None), None)
     if first is None:
         raise DataError("dataset", "none of its frames can be read", "see the warnings above")
-    return Feed(Playback(len(dataset), first.camera.fps, pace is Pace.live))
+    return Feed(Playback(len(dataset), first.camera.fps / requested.step, pace is Pace.live), requested)

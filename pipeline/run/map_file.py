@@ -40,10 +40,10 @@ class SavedMap:
         assert isinstance(latest, Map)
         return latest
 
-    def delay_lines(self, first: int, source: str) -> DelayLines:
-        """Return the values that a run beginning with frame `first` of `source` starts from."""
-        if first == self.frame + 1 and source == self.source:
-            recent = {topic: {value.index: value for value in values} for topic, values in self.values.items()}
+    def delay_lines(self, first: int, stride: int, source: str) -> DelayLines:
+        """Return the values that a run starts from which begins with frame `first` of `source` and takes every `stride`-th."""
+        if first == self.frame + stride and source == self.source:
+            recent = {topic: {(value.index - first) // stride: value for value in values} for topic, values in self.values.items()}
             return DelayLines({topic: values[-1] for topic, values in self.values.items()}, recent)
         held: dict[str, Value] = {"map": self.map, "pose": lost_pose(first - 1)}
         for value in self.values.get("rotation", ())[-1:]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -18,7 +18,7 @@ from trihedron.pipeline.core.errors import DataError, RecordingError
 from trihedron.pipeline.core.graph import Graph
 from trihedron.pipeline.core.options import frame_range
 from trihedron.pipeline.core.slots import CAMERA, SLOTS
-from trihedron.pipeline.core.types import FrameReference, Value
+from trihedron.pipeline.core.types import Frame, FrameReference, Value
 from trihedron.pipeline.core.wires import Wire
 from trihedron.pipeline.record.codec import FRAMES_TOPIC
 from trihedron.pipeline.record.reader import Recording, TopicReader
@@ -60,27 +60,31 @@ class Replay:
         """Return a function from frame number to recorded value, to be called with increasing numbers."""
         return TopicReader(self.recording, topic).at if topic in self.recording.topics | {FRAMES_TOPIC} else lambda index: None
 
-    def references(self, first: int, stop: int | None) -> dict[int, FrameReference]:
+    def references(self, frames: str) -> dict[int, FrameReference]:
         """Return frame number -> reference for the recorded frames in a range. Raises RecordingError when there is none."""
-        found = {value.index: value for value in self.recording.references if value.index >= first and (stop is None or value.index < stop)}
+        wanted = frame_range(frames)
+        found = {value.index: value for value in self.recording.references if value.index in wanted}
         if not found:
-            wanted = f"{first or ''}:{'' if stop is None else stop}"
-            raise RecordingError(str(self.recording.path), f"has none of the frames '{wanted}'", "give another dataset.frames")
+            raise RecordingError(str(self.recording.path), f"has none of the frames '{frames or ':'}'", "give another dataset.frames")
         return found
 
 
 @dataclass(frozen=True)
 class Plan:
     """The stages of a graph that compute, in order, and the numbers of the frames, with the stamps and the rate that are known before reading them.
-    `first` is the number of the first frame that was asked for."""
+    `requested` are the numbers of the data set's frames; of these a replay has those that were recorded."""
 
     graph: Graph
     replay: Replay | None
     computed: tuple[str, ...]
-    first: int
+    requested: range
     indices: Sequence[int]
     stamps_ns: Mapping[int, int]
     fps: float | None = None
+
+    def at_rate(self, frame: Frame) -> Frame:
+        """Return a frame whose camera has the rate of the run: that of the recording, else that of the data set, over the stride."""
+        return at_rate(frame, frame.camera.fps / self.requested.step if self.fps is None else self.fps)
 
     def source(self, parameter: str, wire: Wire) -> Wire:
         """Return the wire of a computed stage's input as nodes have it: from another computed stage, or from the file."""
@@ -89,17 +93,22 @@ class Plan:
         return Wire(RECORDED + topic, wire.delay) if wire.topic not in self.computed or recorded else wire
 
 
+def at_rate(frame: Frame, fps: float) -> Frame:
+    """Return a frame whose camera has a rate, the same where it has."""
+    return frame if frame.camera.fps == fps else replace(frame, camera=replace(frame.camera, fps=fps))
+
+
 def plan_run(graph: Graph, replay: Replay | None, frames: str) -> Plan:
-    """Plan a run over a range of frames ("A:B", see `frame_range`). Raises RecordingError where the recording cannot give what the stages need."""
-    first, stop = frame_range(frames)
+    """Plan a run over a range of frames (see `frame_range`). Raises RecordingError where the recording cannot give what the stages need."""
+    requested = frame_range(frames)
     if replay is None:
-        return Plan(graph, None, tuple(graph.stages), first, range(first, first + len(graph.stages["dataset"].plugin)), {})
+        return Plan(graph, None, tuple(graph.stages), requested, requested[: len(graph.stages["dataset"].plugin)], {})
     computed = replay.computed_stages(graph)
     if "dataset" in computed and "dataset" not in replay.only:
         _check_images(graph, replay)
-    references = replay.references(first, stop)
+    references = replay.references(frames)
     stamps = {index: reference.stamp_ns for index, reference in references.items()}
-    return Plan(graph, replay, computed, first, list(references), stamps, next(iter(references.values())).camera.fps)
+    return Plan(graph, replay, computed, requested, list(references), stamps, next(iter(references.values())).camera.fps)
 
 
 def _check_images(graph: Graph, replay: Replay) -> None:

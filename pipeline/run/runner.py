@@ -72,8 +72,8 @@ class Runner:
         `preview_period` frames sinks get what a fold has so far, if its plugin has a method `preview(state)`; 0: never."""
         self._on_value = on_value
         self.graph, self.seed, self.threads, self.replay = graph, seed, threads, replay
-        self.feed = feed_of(graph.stages["dataset"].plugin, pace) if replay is None else None
         self.plan = plan_run(graph, replay, frames)
+        self.feed = feed_of(graph.stages["dataset"].plugin, pace, self.plan.requested) if replay is None else None
         self.computed, self.indices, self.count = self.plan.computed, self.plan.indices, len(self.plan.indices)  # `count` frames, at most
         delays = max_delays(graph.stages[name] for name in self.computed)
         self.initial = initial(self.indices[0]) if initial is not None else DelayLines()
@@ -115,8 +115,7 @@ class Runner:
 
     def recent(self) -> dict[str, dict[int, Value]]:
         """Return the values before the first frame that `@k` wires read: topic -> position (-1: one frame before) -> value."""
-        first = self.indices[0]
-        return {topic: {index - first: value for index, value in values.items()} for topic, values in self.initial.recent.items()}
+        return {topic: dict(values) for topic, values in self.initial.recent.items()}
 
     @contextmanager
     def _feeding(self) -> Iterator[None]:
@@ -189,12 +188,13 @@ class Runner:
             if self.feed is not None and self.feed.take() is None:
                 raise NoMoreFrames
             began = time.perf_counter()
-            frame = stage.plugin(index=self.indices[at] - self.plan.first)
+            frame = stage.plugin(index=self.plan.requested.index(self.indices[at]))
             ended = time.perf_counter()
             self.accounts.frame_read(at, began, ended, ended if self.feed is None else self.feed.came_s[at])
-            if frame is not None:
-                check_value(stage.name, frame, self.indices[at])
-            return frame
+            if frame is None:
+                return None
+            check_value(stage.name, frame, self.indices[at])
+            return self.plan.at_rate(frame)
 
         return self.validation(position, read, lambda: self.indices[position])
 

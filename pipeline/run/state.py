@@ -14,7 +14,8 @@ from trihedron.pipeline.record.reader import Recording, TopicReader
 
 @dataclass(frozen=True)
 class DelayLines:
-    """`held`: topic -> the latest value before the first frame, for `@prev`; `recent`: topic -> frame number -> value, for `@k`."""
+    """`held`: topic -> the latest value before the first frame, for `@prev`; `recent`: topic -> position (-1: one frame before the first) -> value,
+    for `@k`, which counts the frames of the run whatever their numbers."""
 
     held: Mapping[str, Value] = field(default_factory=dict)
     recent: Mapping[str, Mapping[int, Value]] = field(default_factory=dict)
@@ -40,12 +41,12 @@ class StateBuffer:
     """Holds, after each frame, the values that delayed wires can still read: all that another run needs to continue with the next frame."""
 
     def __init__(self, max_delay: Mapping[str, int], before: DelayLines, first: int) -> None:
-        """`before` are the values that a run beginning with frame `first` starts from."""
-        self._max_delay = max_delay
+        """`before` are the values that a run beginning with frame `first` starts from. `values`: topic -> position -> value, in order."""
+        self._max_delay, self._position = max_delay, 0
         self.values: dict[str, dict[int, Value]] = {topic: dict(before.recent.get(topic, {})) for topic in max_delay}
-        for topic in max_delay:
-            if (held := before.held.get(topic)) is not None:
-                self.values[topic][min(held.index, first - 1)] = held  # of another sequence, its number means nothing here
+        for topic, delay in max_delay.items():
+            if (held := before.held.get(topic)) is not None and not self.values[topic]:
+                self.values[topic][-delay] = held  # only `@prev` reads it, until the next value
             self.values[topic] = dict(sorted(self.values[topic].items()))
         self.frame = first - 1  # number of the last frame
 
@@ -55,9 +56,10 @@ class StateBuffer:
         for topic, delay in self._max_delay.items():
             line = self.values[topic]
             if isinstance(value := values.get(topic), Value):
-                line[index] = value
-            while len(line) > 1 and (oldest := next(iter(line))) <= index - delay:
+                line[self._position] = value
+            while len(line) > 1 and (oldest := next(iter(line))) <= self._position - delay:
                 del line[oldest]
+        self._position += 1
 
 
 def recorded_delay_lines(recording: Recording, max_delay: Mapping[str, int], first: int) -> DelayLines:
@@ -70,7 +72,7 @@ def recorded_delay_lines(recording: Recording, max_delay: Mapping[str, int], fir
         recent[topic] = {}
         for ago in range(min(max_delay[topic], len(frames)), 0, -1):
             if (value := reader.at(frames[-ago])) is not None:
-                recent[topic][first - ago] = value
+                recent[topic][-ago] = value
         reader.at(first)
         if (latest := recent[topic][max(recent[topic])] if recent[topic] else reader.latest) is not None:
             held[topic] = latest

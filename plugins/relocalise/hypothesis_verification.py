@@ -43,10 +43,11 @@ def recognise(options: RelocaliseOptions, ways: tuple[Hypotheses, ...], view: Fr
     if map is None or previous is None:
         return None
     frame, lost = view.frame, previous.status == LOST
-    submaps = _submaps(options, map, submap_of(previous, map), lost, frame.index)
+    count = frame.index // max(frame.index - previous.index, 1)  # of the frames of a run that takes every S-th, too
+    submaps = _submaps(options, map, submap_of(previous, map), lost, frame.index, count)
     if not len(submaps):
         return None
-    look = frame.index if lost else frame.index // options.every
+    look = count if lost else count // options.every
     submap = int(submaps[look % len(submaps)])
     keyframes = block_of(keyframes_of(map, submap), options.block, look)
     keyframes = candidate_keyframes(map, view.keypoints, view.segments, keyframes, options.candidates, options.max_bits)
@@ -65,14 +66,14 @@ def recognise(options: RelocaliseOptions, ways: tuple[Hypotheses, ...], view: Fr
     return Pose(frame.index, frame.stamp_ns, T, best.covariance, T_reference_camera, reference, best.inliers, 0, status, reason, submap)
 
 
-def _submaps(options: RelocaliseOptions, map: Map, submap: int, lost: bool, index: int) -> I32:
+def _submaps(options: RelocaliseOptions, map: Map, submap: int, lost: bool, index: int, count: int) -> I32:
     """Sub-maps to search: all for a lost camera; now and then the older ones for one tracked in a sub-map that is not merged with the first, and in
     each frame those that a recent proposal would merge it with."""
     known = np.unique(map.keyframes.rows("submap", living_keyframes(map))).astype(np.int32)
     if lost:
         return known
     proposed = proposed_submaps(map, submap, index)
-    return proposed if len(proposed) else known[known < submap] if index % options.every == 0 else known[:0]
+    return proposed if len(proposed) else known[known < submap] if count % options.every == 0 else known[:0]
 
 
 def _accept(options: RelocaliseOptions, place: VerifiedPlace) -> bool:

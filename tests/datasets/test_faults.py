@@ -56,6 +56,20 @@ def test_one_image_freezes_and_the_other_goes_on(frozen):
         assert np.array_equal(seen.depth_m, plain[position if frozen is Covered.color else still].depth_m)
 
 
+def test_a_stride_is_of_the_frames_as_they_arrive_and_a_cover_of_those_underneath():
+    (plain, _), faults = still_frames(0, 12), Faults("1::4", "synthetic", {**SMALL, "length": 12}, cover="0:12:3", drop="2:3")
+    seen = [faults(position) for position in range(len(faults))]
+    assert [frame.index for frame in seen] == [1, 5, 9]  # which are 1, 6 and 10 underneath
+    assert [frame.stamp_ns for frame in seen] == [plain[k].stamp_ns for k in (1, 6, 10)]
+    assert [bool(frame.color.any()) for frame in seen] == [True, False, True]
+
+
+def test_depth_is_slower_than_color():
+    (plain, _), faults = still_frames(0, 6), Faults("0:6", "synthetic", SMALL, depth_every=3)
+    for position, fresh in enumerate((0, 0, 0, 3, 3, 3)):
+        assert np.array_equal(faults(position).color, plain[position].color) and np.array_equal(faults(position).depth_m, plain[fresh].depth_m)
+
+
 def test_color_is_mirrored_shuffled_or_random_and_depth_is_not():
     options = {**SMALL, "length": 12}
     plain = [Synthetic(width=64, height=48, motion=Motion.pan, length=12)(i) for i in range(12)]

@@ -46,6 +46,8 @@ def test_frames_is_a_half_open_range_of_the_whole_data_set(tum_folder: Path, cap
     frames = [dataset(0), dataset(1)]
     assert len(dataset) == 2
     assert [(f.index, f.stamp_ns) for f in frames if f] == [(1, 10_100_000_000), (2, 10_200_000_000)]
+    strided = Tum(path=str(tum_folder), frames="1::2")
+    assert [(f.index, f.stamp_ns) for f in map(strided, range(len(strided))) if f] == [(1, 10_100_000_000), (3, 10_300_000_000)]
     assert len(Tum(path=str(tum_folder), frames=":2")) == 2
     with caplog.at_level(logging.WARNING, logger="trihedron"):
         assert len(Tum(path=str(tum_folder), frames="2:9")) == 2
@@ -228,3 +230,19 @@ def test_published_depth_agrees_under_the_truth(
     assert truth is not None and a is not None and b is not None
     T_a, T_b = (truth.poses[int(np.argmin(np.abs(truth.stamps_ns - f.stamp_ns)))] for f in (a, b))
     assert warp_error_m(a, b, T_a, T_b) < limit_m
+
+
+@pytest.mark.parametrize("late_ms, warned", [(17, True), (5, False)])
+def test_images_paired_by_order_whose_names_are_other_times_are_named(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, late_ms: int, warned: bool
+) -> None:
+    """Five frames of 50 Hz with names in milliseconds since 1970."""
+    for kind, late in (("rgb", 0), ("depth", late_ms)):
+        (tmp_path / kind).mkdir()
+        for k in range(5):
+            (tmp_path / kind / f"{1_700_000_000_995 + 20 * k + late}.png").touch()
+    (tmp_path / "camera.yaml").write_text("width: 64\nheight: 48\nfx: 50\nfy: 50\ncx: 31.5\ncy: 23.5\ndepth_scale: 1000\n")
+    assert len(Folder(path=str(tmp_path))) == 5
+    line = "by their names the colour and depth of 5 of 5 frames are more than half a frame apart, by 17.0 ms (median); "
+    cure = "remove images without a partner, and give the two of a pair the same name"
+    assert caplog.messages == ([f"{tmp_path}: {line}{cure}"] if warned else [])

@@ -173,7 +173,8 @@ def test_a_file_that_is_cut_off_is_read_as_far_as_it_is_whole(tmp_path: Path, ca
 def test_frames_come_in_any_order_from_any_thread(tmp_path: Path) -> None:
     path = write_file(tmp_path / "robot.mcap", registered(30), chunk_size=20_000)
     dataset = McapDataset(str(path), frames="5:25")
-    assert len(dataset) == 20
+    strided = McapDataset(str(path), frames="5:25:8")
+    assert len(dataset) == 20 and [frame.index for frame in map(strided, range(len(strided))) if frame] == [5, 13, 21]
     order = np.random.default_rng(0).permutation(np.repeat(np.arange(20), 5)).tolist()
     with ThreadPoolExecutor(4) as pool:
         for k, frame in zip(order, pool.map(dataset, order)):

@@ -153,7 +153,7 @@ def test_the_selection_and_its_truth() -> None:
         ({"seed": -1}, "seed: -1 is not at least 0"),
         ({"scene": Scene.rooms, "motion": Motion.pan}, "motion: pan is for the room, a building is walked through"),
         ({"scene": Scene.offices, "slanted": True}, "slanted: only the room has slanted walls"),
-        ({"frames": "5"}, "frames: '5' is not a range of frames A:B with A < B"),
+        ({"frames": "5"}, "frames: '5' is not a range of frames A:B[:S] with A < B, S > 0"),
     ],
 )
 def test_values_out_of_range_are_refused(values: dict[str, Any], message: str) -> None:

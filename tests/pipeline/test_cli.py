@@ -69,7 +69,7 @@ MISTAKES = [
     (["+graph.planes.foo=dataset"], 1, "trihedron: graph.planes.foo: the slot 'planes' has no input 'foo'; known: frame, normals"),
     (["outputs=[trajektory]"], 1, "trihedron: outputs: no stage writes 'trajektory'; did you mean 'trajectory'?"),
     (["outputs=[]"], 1, "trihedron: outputs: is empty, so nothing would run; give 'outputs=[trajectory]'"),
-    (["dataset.frames=9:3"], 1, f"trihedron: dataset.frames: '9:3' is not a range of frames A:B with A < B; {SEE} dataset synthetic"),
+    (["dataset.frames=9:3"], 1, f"trihedron: dataset.frames: '9:3' is not a range of frames A:B[:S] with A < B, S > 0; {SEE} dataset synthetic"),
     (["dataset=tums"], 1, "trihedron: dataset: there is no plugin 'tums' for the slot 'dataset'; did you mean 'tum'?"),
     (["only=[pose]"], 1, "trihedron: only: chooses stages of a replay, and there is none; give replay=FILE.mcap too"),
     (["replay=no.mcap"], 1, "trihedron: no.mcap: cannot be read: No such file or directory; give the path of an MCAP file"),

@@ -58,6 +58,51 @@ def test_at_a_low_rate_the_first_repetition_is_stale(caplog):
     assert not found[1].depth_m.any() and len(warnings) == 1
 
 
+def slower(fresh, period_ms=33):
+    """Frames whose colour is always new and whose depth is that of the frame of this number, and the validated ones with a camera of that rate."""
+    camera = replace(CAMERA, fps=1000 / period_ms)
+    return [replace(frame(k, frame(number).depth_m, period_ms=period_ms), camera=camera) for k, number in enumerate(fresh)]
+
+
+def has_depth(found):
+    return "".join(".x"[bool(f.depth_m.any())] for f in found)
+
+
+@pytest.mark.parametrize(
+    "period, period_ms, start, message",
+    [
+        (2, 33.0, "x" * 10, "about 15.2 Hz instead of 30.3: only every second depth image is new"),
+        (2, 66.0, "x.x.x.x.x.", "about 7.58 Hz instead of 15.2: only every second depth image is new"),
+        (3, 33.0, "xx.xx.xx.xx.xx.", "about 10.1 Hz instead of 30.3: only every third depth image is new"),
+        (4, 33.0, "xx..xx..xx..xx..xx..", "about 7.58 Hz instead of 30.3: only every 4th depth image is new"),
+    ],
+)
+def test_depth_slower_than_colour_is_named_once_and_an_old_image_counts_as_missing(caplog, period, period_ms, start, message):
+    found, warnings = validated(slower([k - k % period for k in range(8 * period)], int(period_ms)), caplog)
+    assert has_depth(found) == start + 3 * ("x" + (period - 1) * ".")
+    assert warnings == [
+        f"depth is slower than colour, {message}, a repeated one counts as missing; "
+        f"record depth at the rate of colour, or take the frames with new depth alone: dataset.frames=0::{period}"
+    ]
+
+
+def test_slow_depth_that_freezes_is_named(caplog):
+    """One image that was missed is none of it."""
+    found, warnings = validated(slower([k - k % 2 for k in range(12)] + [10, 10, 14, 14, *[16] * 6]), caplog)
+    assert has_depth(found) == "x" * 10 + "x...x.x....."
+    assert warnings[1:] == [
+        f"frame {k}: its depth is that of frame 16, bit for bit, while colour has changed; it counts as missing" for k in (20, 21)
+    ]
+
+
+def test_depth_that_repeats_irregularly_is_frozen_each_time(caplog):
+    """Each image stays for two, three, two, ... frames of 15 Hz: no rate; what was held back at first is said as soon as that shows."""
+    found, warnings = validated(slower([0, 0, 2, 2, 4, 4, 4, 7, 7, 9], 66), caplog)
+    assert has_depth(found) == "x.x.x..x.x"
+    frozen = [(1, 0), (3, 2), (5, 4), (6, 4), (8, 7)]
+    assert warnings == [f"frame {a}: its depth is that of frame {b}, bit for bit, while colour has changed; it counts as missing" for a, b in frozen]
+
+
 def test_a_camera_at_rest_and_repeated_frames_are_no_fault(caplog):
     """Exact depth of a scene that stands still, with noise in colour alone; and whole frames that are repeated."""
     depth, color = frame(0).depth_m, np.full((120, 160, 3), 120, np.uint8)

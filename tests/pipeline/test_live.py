@@ -108,6 +108,19 @@ def test_a_late_run_drops_frames_and_stays_on_time(tmp_path: Path, clock: Clock)
     assert max(latencies_s(runner, done)) < 0.15  # at the end of a queue: 900 ms
 
 
+def test_every_fourth_frame_comes_at_a_quarter_of_the_rate(tmp_path: Path, clock: Clock) -> None:
+    """Frames 2, 6, … of 200 Hz, one every 20 ms, for a stage that takes 30 ms: some are dropped, and the recording has the numbers of the others."""
+    graph = toy_graph(dataset=FastDataset(30, start=2, stride=4), pose=SlowPose(0.03))
+    runner = Runner(graph, threads=2, pace=Pace.live, frames="2:122:4")
+    for _ in runner.steps(None, frozenset()):
+        pass
+    assert runner.feed is not None
+    numbers, summary = runner.feed.numbers, runner.feed.summary({})
+    assert numbers[0] == 2 and numbers[-1] == 118 and {number % 4 for number in numbers} == {2}
+    assert summary["came"] == 30 and summary["taken"] == len(numbers) < 30
+    assert runner.feed.came_s == pytest.approx([(number - 2) / 200.0 for number in numbers])
+
+
 def test_a_run_in_time_takes_every_frame_when_it_comes(tmp_path: Path, clock: Clock) -> None:
     runner, path, _ = run(tmp_path, Pace.live, dataset=FastDataset(15, fps=20.0))
     assert runner.feed is not None and taken(path) == list(range(15))

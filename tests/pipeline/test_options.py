@@ -1,5 +1,6 @@
 """Ranges of options: each is enforced when a plugin is constructed, named in the error, and holds for the default."""
 
+import sys
 from dataclasses import dataclass, replace
 from typing import Annotated
 
@@ -28,7 +29,12 @@ BOUNDS = [  # range, its text, permitted, refused
     (Range(above=0, below=90), "above 0 and below 90", (89.9,), (0, 90)),
     (Range(0, below=45), "at least 0 and below 45", (0, 44.9), (45, -0.1)),
     (OneOf(3, 5, 7), "one of 3, 5, 7", (3, 7), (4,)),
-    (FrameRange(), "a range of frames A:B with A < B", ("", "3:", ":4", "3:4"), ("3", "4:3", "a:b", "-2:")),
+    (
+        FrameRange(),
+        "a range of frames A:B[:S] with A < B, S > 0",
+        ("", "3:", ":4", "3:4", "3:4:2", "::"),
+        ("3", "4:3", "a:b", "-2:", "0:500:0", "0:500:-1", "1:2:3:4"),
+    ),
 ]
 
 
@@ -40,7 +46,9 @@ def test_a_range_permits_what_its_text_states(constraint, text, permitted, refus
 
 
 def test_a_range_of_frames():
-    assert [frame_range(text) for text in ("", "3:", ":4", " 3 : 14 ")] == [(0, None), (3, None), (0, 4), (3, 14)]
+    assert [frame_range(text) for text in ("", "3:", ":4", " 3 : 14 ", "3:14:4", "::5")] == [
+        *(range(sys.maxsize), range(3, sys.maxsize), range(4), range(3, 14), range(3, 14, 4), range(0, sys.maxsize, 5)),
+    ]
 
 
 @dataclass(frozen=True)
@@ -71,7 +79,9 @@ class Inherits(Example):
         (Example, {"low": float("nan")}, "low: nan is not positive"),
         (Example, {"low": 3.0}, "low: 3.0 is not at most high, 2.0"),
         (Example, {"low": 30.0, "high": 20.0}, "high: 20.0 is not within 0 … 10"),  # the range before the order
-        (Example, {"frames": "5"}, "frames: '5' is not a range of frames A:B with A < B"),
+        (Example, {"frames": "5"}, "frames: '5' is not a range of frames A:B[:S] with A < B, S > 0"),
+        (Example, {"frames": "0:500:0"}, "frames: '0:500:0' is not a range of frames A:B[:S] with A < B, S > 0"),
+        (Example, {"frames": "0:500:-1"}, "frames: '0:500:-1' is not a range of frames A:B[:S] with A < B, S > 0"),
         (Inherits, {"share": -1}, "share: -1 is not within 0 … 1"),
         (Inherits, {"high": 5.0}, "high: 5.0 is not within 0 … 4"),
         (Inherits, {"window": 4}, "window: 4 is not one of 3, 5"),

@@ -8,14 +8,16 @@ import numpy as np
 import pytest
 
 from trihedron.pipeline.core.errors import DataError, RecordingError, StageError
+from trihedron.pipeline.record.codec import Encoder
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.writer import RecordingWriter
 from trihedron.pipeline.run import warm_up
 from trihedron.pipeline.run.replay import Replay
 from trihedron.pipeline.run.runner import Runner
+from trihedron.pipeline.run.state import StateBuffer
 
 sys.path.insert(0, str(Path(__file__).parent))
-from toys import TOPICS, ToyDataset, ToyRotation, contents, toy_graph
+from toys import CAMERA, TOPICS, ToyDataset, ToyRotation, contents, toy_graph
 
 
 def record(path, graph=None, threads=2, replay=None, topics=TOPICS, frames="", **options):
@@ -113,6 +115,51 @@ def test_replay_of_a_range_begins_with_the_recorded_past(tmp_path):
     part = {v.index: v for v in Recording(tmp_path / "b.mcap").values("pose")}
     assert runner.indices == [6, 7, 8] and sorted(part) == [6, 7, 8]
     assert all(np.array_equal(part[i].T_world_camera, whole[i].T_world_camera) for i in part)
+
+
+STRIDED = ToyDataset(length=9, start=2, stride=4)  # frames 2, 6, … 34
+
+
+def test_a_run_of_every_fourth_frame_has_their_numbers_and_a_quarter_of_the_rate(tmp_path):
+    runner = record(tmp_path / "a.mcap", toy_graph(dataset=STRIDED), frames="2:36:4")
+    references = list(Recording(tmp_path / "a.mcap").references)
+    assert list(runner.indices) == [value.index for value in references] == list(range(2, 36, 4))
+    assert {value.camera.fps for value in references} == {CAMERA.fps / 4} == {runner.result.fps}
+
+
+@pytest.mark.parametrize("only", [("dataset", "keypoints", "rotation", "pose", "map"), ("rotation",), ("keypoints", "pose")])
+@pytest.mark.parametrize("feedback", [False, True])
+def test_a_replay_of_every_fourth_frame_gives_its_bytes(tmp_path, only, feedback):
+    record(tmp_path / "a.mcap", toy_graph(dataset=STRIDED), frames="2:36:4")
+    replay = Replay(Recording(tmp_path / "a.mcap"), only, feedback)
+    record(tmp_path / "b.mcap", toy_graph(dataset=STRIDED), replay=replay, topics=frozenset(only) - {"dataset"}, frames="2:36:4")
+    whole, again = contents(tmp_path / "a.mcap"), contents(tmp_path / "b.mcap")
+    assert all(again[name] == whole[name] for name in ("/frames", *(f"/{stage}" for stage in only if stage != "dataset")))
+
+
+def test_a_replay_of_consecutive_numbers_takes_the_recorded_ones_among_them(tmp_path):
+    """The frames are read from the data set by their numbers, and have the rate they were recorded with."""
+    record(tmp_path / "a.mcap", toy_graph(dataset=STRIDED), frames="2:36:4")
+    replay = Replay(Recording(tmp_path / "a.mcap"), ("dataset", "keypoints", "rotation", "pose"))
+    part = toy_graph(dataset=ToyDataset(length=16, start=8))
+    topics = frozenset({"keypoints", "rotation", "pose"})
+    runner = record(tmp_path / "b.mcap", part, replay=replay, topics=topics, frames="8:24")
+    assert runner.indices == [10, 14, 18, 22] and {value.camera.fps for value in Recording(tmp_path / "b.mcap").references} == {CAMERA.fps / 4}
+    for topic in topics:
+        whole = {value.index: Encoder().encode(value) for value in Recording(tmp_path / "a.mcap").values(topic)}
+        assert all(whole[value.index] == Encoder().encode(value) for value in Recording(tmp_path / "b.mcap").values(topic))
+
+
+def test_a_stride_does_not_change_what_delayed_wires_read(tmp_path):
+    """Nine consecutive frames and every sixth of 54: each has the values of as many frames before, by position."""
+    kept = []
+    for dataset, frames in ((ToyDataset(length=9), "0:9"), (ToyDataset(length=9, stride=6), "0:54:6")):
+        runner = Runner(toy_graph(dataset=dataset), frames=frames)
+        runner.state = StateBuffer({"rotation": 3, "pose": 1}, runner.initial, 0)
+        for _ in runner.steps(None, frozenset()):
+            pass
+        kept.append({topic: list(values) for topic, values in runner.state.values.items()})
+    assert kept[0] == kept[1] == {"rotation": [6, 7, 8], "pose": [8]}
 
 
 def test_replay_of_no_frame_says_so(tmp_path):

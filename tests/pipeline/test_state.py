@@ -16,7 +16,7 @@ from trihedron.pipeline.record import mcap_writer
 from trihedron.pipeline.record.codec import Encoder
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.writer import RecordingWriter
-from trihedron.pipeline.run.map_file import load_map, save_map
+from trihedron.pipeline.run.map_file import SavedMap, load_map, save_map
 from trihedron.pipeline.run.runner import Runner
 from trihedron.pipeline.run.state import DelayLines, StateBuffer, max_delays
 from trihedron.plugins.mapping.landmarks import empty_map
@@ -92,12 +92,14 @@ def test_a_replay_loads_the_map_again_and_saves_none(runs):
 
 
 @pytest.mark.parametrize("cut, rotations", [(7, [5, 6]), (8, [5, 6, 7])])  # rotation says nothing at frame 4
-def test_a_run_continues_with_the_values_of_wires_of_any_delay(cut, rotations):
+@pytest.mark.parametrize("stride", [1, 6])
+def test_a_run_continues_with_the_values_of_wires_of_any_delay(cut, rotations, stride):
     """Some of twelve frames, and the rest: what `@prev` and `@k` see is what they see in twelve frames at once."""
 
     def run(count, start, initial=None):
-        runner = Runner(toy_graph(outputs=("trajectory",), dataset=ToyDataset(length=count, start=start)), frames=f"{start}:", initial=initial)
-        runner.state = StateBuffer({"rotation": 3, "pose": 1}, runner.initial, start)
+        dataset = ToyDataset(length=count, start=start * stride, stride=stride)
+        runner = Runner(toy_graph(outputs=("trajectory",), dataset=dataset), frames=f"{start * stride}::{stride}", initial=initial)
+        runner.state = StateBuffer({"rotation": 3, "pose": 1}, runner.initial, start * stride)
         for _ in runner.steps(None, frozenset()):
             pass
         return runner
@@ -105,9 +107,11 @@ def test_a_run_continues_with_the_values_of_wires_of_any_delay(cut, rotations):
     whole, first = run(12, 0), run(cut, 0)
     kept = first.state.values
     assert list(kept["rotation"]) == rotations and list(kept["pose"]) == [cut - 1]
-    lines = DelayLines({topic: list(values.values())[-1] for topic, values in kept.items()} | {"map": first.result.map}, kept)
+    saved = SavedMap(first.state.frame, "", {topic: tuple(values.values()) for topic, values in kept.items()} | {"map": (first.result.map,)})
+    lines = saved.delay_lines(cut * stride, stride, "")
+    assert list(lines.recent["rotation"]) == [number - cut for number in rotations]
     rest = run(12 - cut, cut, lambda _: lines)
-    assert [p.T_world_camera[0, 3] for p in rest.result.poses] == [p.T_world_camera[0, 3] for p in whole.result.poses if p.index >= cut]
+    assert [p.T_world_camera[0, 3] for p in rest.result.poses] == [p.T_world_camera[0, 3] for p in whole.result.poses if p.index >= cut * stride]
 
 
 def test_the_maximum_delay_of_a_topic():

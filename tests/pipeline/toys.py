@@ -41,12 +41,13 @@ class ToyDataset:
     length: int = 12
     unreadable: tuple[int, ...] = ()
     start: int = 0  # number of the first frame
+    stride: int = 1  # from the number of a frame to the next
 
     def __len__(self) -> int:
         return self.length
 
     def __call__(self, index: int) -> Frame | None:
-        index += self.start
+        index = self.start + index * self.stride
         if index in self.unreadable:
             return None
         rng = np.random.default_rng(index)

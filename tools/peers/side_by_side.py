@@ -11,7 +11,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ import numpy as np
 
 from trihedron.comparison.other_programs import Reference, judge, references
 from trihedron.pipeline.core.errors import DataError, TrihedronError, UsageError, printable
+from trihedron.pipeline.core.options import frame_range
 from trihedron.pipeline.core.text_table import table
 from trihedron.pipeline.core.types import F64, Camera, Trajectory
 from trihedron.pipeline.record.codec import TIMING_TOPIC, timing_of
@@ -121,7 +122,8 @@ def write_job(dataset: Any, peer: Peer, folder: Path) -> Job:
                 frames[frame.stamp_ns] = str(file)
         if camera is None:
             raise DataError(PLACE, "no frame can be read", "see trihedron run with the same words")
-        (folder / "settings.yaml").write_text(settings_of(camera))
+        stride = frame_range(str(getattr(dataset, "frames", ""))).step
+        (folder / "settings.yaml").write_text(settings_of(replace(camera, fps=camera.fps / stride)))
         job = {"vocabulary": str(peer.vocabulary), "settings": str(folder / "settings.yaml"), "out": str(folder)}
         (folder / "job.json").write_text(json.dumps({**job, "frames": [(stamp_ns / 1e9, file) for stamp_ns, file in frames.items()]}))
     except OSError as error:
