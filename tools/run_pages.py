@@ -74,6 +74,11 @@ class RunFacts:
         return Path(str(self._dataset.get("path") or "")).name
 
     @property
+    def data_name(self) -> str:
+        """Return the name of the data set's folder, or the scene of the simulation."""
+        return self.folder_name or str(self._dataset.get("scene") or self._dataset.get("plugin") or "data")
+
+    @property
     def data_set(self) -> str:
         """Return the data set's plugin and folder."""
         return f"{self._dataset.get('plugin', '')} {self.folder_name}".strip() or "unknown"

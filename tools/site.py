@@ -25,6 +25,7 @@ from trihedron.pipeline.core.files import MAX_YAML_BYTES, YamlError, make_folder
 from trihedron.tools import published
 from trihedron.tools.arguments import Parser
 from trihedron.tools.pages import render
+from trihedron.tools.row_labels import data_labels, system_labels
 from trihedron.tools.run_configurations import changed_options
 from trihedron.tools.run_pages import RunFacts, facts_of, run_page
 from trihedron.tools.site_ablations import Ablation, ablation_page, ablations_of
@@ -57,10 +58,12 @@ LEGEND = [
 
 @dataclass(frozen=True)
 class Cell:
-    """The runs of one system on one data set, their row of the table, and what the paper has."""
+    """The runs of one system on one data set, the labels of both, their row of the table, and what the paper has."""
 
     data: str
     change: str
+    system: str
+    title: str
     facts: tuple[RunFacts, ...]
     row: dict[str, Any]
     badge: Badge
@@ -90,10 +93,12 @@ def main(argv: list[str]) -> int:
 def cells_of(runs: Sequence[Run]) -> list[Cell]:
     """Return the cells of runs: those of one data set stand together."""
     facts = {run.folder: facts_of(run) for run in runs}
+    groups = {place: tuple(facts[run.folder] for run in same) for place, same in groups_of(runs).items()}
+    firsts = [known[0] for known in groups.values()]
     cells = []
-    for (data, change), same in groups_of(runs).items():
-        row, known = row_of(data, change, same), tuple(facts[run.folder] for run in same)
-        cells.append(Cell(data, change, known, row, badge_of(known[0], row)))
+    for ((data, change), known), system, title in zip(groups.items(), system_labels(firsts), data_labels(firsts)):
+        row = row_of(data, change, [one.run for one in known])
+        cells.append(Cell(data, change, system, title, known, row, badge_of(known[0], row)))
     return cells
 
 
@@ -146,7 +151,7 @@ def write_site(
     columns = [name for name in COLUMNS if any(name in cell.row["figures"] for cell in cells)]
     for cell in cells:
         for facts in cell.facts:
-            title_of_run = f"{_system(cell)}, {_data_title(cell)}"
+            title_of_run = f"{cell.system}, {cell.title}"
             page = run_page(facts, title_of_run, facts.commit != commit, pictures, changed_options({"value": facts}))
             write_file(out / "runs" / f"{names[facts.run.folder]}.html", page)
     for ablation in ablations:
@@ -179,19 +184,10 @@ def _data_of(cells: Sequence[Cell]) -> list[str]:
     return list(dict.fromkeys(cell.data for cell in cells))
 
 
-def _data_title(cell: Cell) -> str:
-    dataset = str((cell.facts[0].config.get("dataset") or {}).get("plugin", "") or "data")
-    return cell.facts[0].folder_name or " ".join([dataset, *[word for word in cell.data.split() if not word.startswith("dataset=")]])
-
-
-def _system(cell: Cell) -> str:
-    return cell.change.removeprefix("graph=") or cell.facts[0].graph
-
-
 def _page_names(cells: Sequence[Cell]) -> dict[Path, str]:
     """Return a file name for each run: a number, and what it is."""
     runs = [(cell, facts) for cell in cells for facts in cell.facts]
-    slugs = [re.sub(r"[^a-z0-9]+", "-", f"{_system(cell)} {_data_title(cell)}".lower()).strip("-")[:60] for cell, _ in runs]
+    slugs = [re.sub(r"[^a-z0-9]+", "-", f"{cell.system} {cell.title}".lower()).strip("-")[:60] for cell, _ in runs]
     return {facts.run.folder: f"{number:03}-{slug}" for number, ((_, facts), slug) in enumerate(zip(runs, slugs))}
 
 
@@ -207,8 +203,8 @@ def _group(
         ]
         texts = [figure_text(cell.row, name) for name in columns]
         band = outside.get((cell.data, cell.change), "")
-        shown.append({"system": _system(cell), "texts": texts, "badge": cell.badge, "band": band, "note": cell.row["note"], "links": links})
-    title = _data_title(cells[0])
+        shown.append({"system": cell.system, "texts": texts, "badge": cell.badge, "band": band, "note": cell.row["note"], "links": links})
+    title = cells[0].title
     return {
         "id": re.sub(r"[^a-z0-9]+", "-", f"data-{title} {data}".lower()).strip("-"),
         "title": title,

@@ -69,6 +69,16 @@ def test_what_cannot_be_compared_states_why(tmp_path: Path) -> None:
     assert badge(tmp_path / "f", None) == "not comparable: no error was computed"
 
 
+def test_rows_are_labelled_by_what_differs(tmp_path: Path) -> None:
+    for number, words in enumerate(([], ["planes=cape"], ["graph=structural"], ["planes=cape", "seed=1"])):
+        folder = tmp_path / str(number) / ".hydra"
+        folder.mkdir(parents=True)
+        (folder / "overrides.yaml").write_text(yaml.safe_dump(words))
+    runs = read_runs(tmp_path)
+    assert [(cell.system, len(cell.facts)) for cell in site.cells_of(runs)] == [("default", 1), ("planes=cape", 2), ("graph=structural", 1)]
+    assert [cell.system for cell in site.cells_of(runs[:1])] == ["structural"]
+
+
 def test_every_page_is_valid_and_needs_nothing_from_elsewhere(pages: Path) -> None:
     files = [pages / "index.html", *(pages / "runs").iterdir()]
     assert len(files) == 2 and sum(file.stat().st_size for file in files) < 200_000

@@ -134,8 +134,8 @@ def groups_of(runs: Sequence[Run]) -> dict[tuple[str, str], list[Run]]:
     varying = sorted(key for key in keys if len({run.overrides.get(key) for run in own}) > 1)
     groups: dict[tuple[str, str], list[Run]] = {}
     for run in runs:
-        change = run.label or _override_text(run, [k for k in varying if not _of_data(k)])
-        groups.setdefault((_override_text(run, [k for k in varying if _of_data(k)]), change), []).append(run)
+        change = run.label or _override_text(run, [k for k in varying if not is_of_data(k)])
+        groups.setdefault((_override_text(run, [k for k in varying if is_of_data(k)]), change), []).append(run)
     order = list(dict.fromkeys(data for data, _ in groups))
     return dict(sorted(groups.items(), key=lambda group: order.index(group[0][0])))
 
@@ -221,10 +221,17 @@ def _check_baseline(baseline: str, changes: Sequence[str]) -> None:
         raise UsageError("--baseline", f"no row is '{baseline}'", did_you_mean(baseline, {change for change in changes if change}))
 
 
-def _of_data(key: str) -> bool:
+def is_of_data(key: str) -> bool:
+    """Return True for the key of an option of the data set."""
     return key.partition(".")[0] == "dataset"
 
 
+def shown_words(run: Run) -> dict[str, str]:
+    """Return the overrides that tell a run's row from others, by key; of a path its last part."""
+    return {key: Path(value).name for key, value in run.overrides.items() if key not in NOT_SHOWN and value != "null"}
+
+
 def _override_text(run: Run, keys: Sequence[str]) -> str:
-    """Overrides of a run for these keys; of a path its last part."""
-    return " ".join(f"{key}={Path(run.overrides[key]).name}" for key in keys if run.overrides.get(key, "null") != "null")
+    """Overrides of a run for these keys."""
+    words = shown_words(run)
+    return " ".join(f"{key}={words[key]}" for key in keys if key in words)
