@@ -163,8 +163,7 @@ def row_of(data: str, change: str, same: Sequence[Run], base: Sequence[Run] | No
     for name in FIGURES:
         values = [run.figures[name] for run in same if np.isfinite(run.figures[name])]
         if values:
-            spread = {"median": float(np.median(values)), "min": min(values), "max": max(values), "runs": len(values)}
-            figures[name] = {**spread, "mean": float(np.mean(values)), "half": half_interval(values)}
+            figures[name] = {**spread_of(values), "mean": float(np.mean(values)), "half": half_interval(values)}
     notes = dict.fromkeys(run.note for run in same if run.note)
     return {
         "data": data,
@@ -177,15 +176,24 @@ def row_of(data: str, change: str, same: Sequence[Run], base: Sequence[Run] | No
     }
 
 
+def spread_of(values: Sequence[float]) -> dict[str, Any]:
+    """Return median, smallest and largest of the values of some runs, and their number."""
+    return {"median": float(np.median(values)), "min": min(values), "max": max(values), "runs": len(values)}
+
+
 def verdicts_against(runs: Sequence[Run], baseline: str) -> list[Verdict]:
     """Return the verdict of each change against the baseline in each figure, over all data and seeds that both have; none without a baseline."""
     groups = groups_of(runs) if baseline else {}
     pairs: dict[tuple[str, str], list[tuple[Sample, Sample]]] = {}
     for (data, change), same in groups.items():
-        for run, base in _pairs(same, groups.get((data, baseline), [])) if change != baseline else []:
-            samples = paired_samples(base.folder, run.folder, (base.figures, run.figures))
-            pairs.setdefault((baseline, change or "-"), []).append(samples)
+        if change != baseline:
+            pairs.setdefault((baseline, change or "-"), []).extend(samples_of(same, groups.get((data, baseline), [])))
     return verdicts_of(pairs, COLUMNS)
+
+
+def samples_of(runs: Sequence[Run], base: Sequence[Run]) -> list[tuple[Sample, Sample]]:
+    """Return the samples of the runs of one row that have the seeds of a run of the baseline's row, that run's first."""
+    return [paired_samples(other.folder, run.folder, (other.figures, run.figures)) for run, other in _pairs(runs, base)]
 
 
 def with_verdicts(rows: Sequence[dict[str, Any]], found: Sequence[Verdict]) -> list[dict[str, Any]]:
