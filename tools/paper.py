@@ -1,7 +1,8 @@
 """Print the paper's own tables over some runs, the published figures beside ours: trajectory error, times, refinement, surface and drift.
 
-Sequences of the paper that are not there are named, with the command that gets them. The runs are those of `experiment=paper`, or any others of the
-same graphs. Surfaces that were not judged yet are judged against the ground truth of the scene, where there is one.
+Sequences of the paper that are not there are named, with the command that gets them; data without published figures have tables of their own. Rows
+are labelled by what differs between them. The runs are those of `experiment=paper`, or any others of the same graphs. Surfaces that were not judged
+yet are judged against the ground truth of the scene, where there is one.
 
 Example: trihedron run -m experiment=paper out=runs/paper && trihedron paper runs/paper --markdown paper.md
 """
@@ -27,6 +28,7 @@ from trihedron.pipeline.record.trajectories import attached_truth, read_trajecto
 from trihedron.pipeline.run.metrics import associate
 from trihedron.tools import published
 from trihedron.tools.arguments import Parser
+from trihedron.tools.row_labels import data_labels, row_labels, system_labels
 from trihedron.tools.run_pages import RunFacts, facts_of, read_json
 
 Known = Sequence[tuple[RunFacts, dict[str, Any]]]  # the first run of a cell, and its row
@@ -39,6 +41,7 @@ STAGE_GROUPS = {  # column of Table II -> our stages
 WITH, WITHOUT = "structural_paper", "structural_no_refine"
 LONG_PATH_M = 20.0  # of a walk whose drift means something
 NONE = "-"
+OTHER = "Other data"  # than the paper has figures of
 
 
 @dataclass(frozen=True)
@@ -83,28 +86,39 @@ def known_of(folders: Sequence[Path]) -> Known:
 
 
 def tables_of(known: Known) -> list[Table]:
-    """Return the paper's tables, filled with the rows of some runs; a table without a row of ours is absent, but for Table I."""
-    found = [trajectory_table(known), time_table(known), refinement_table(known), surface_table(known), drift_table(known)]
+    """Return the paper's tables, filled with the rows of some runs on the sequences that each has published figures of, then those of other data. A
+    table without a row of ours is absent, but for Table I."""
+    parts = {figure: [_part(known, figure, of_paper) for of_paper in (True, False)] for figure in ("ate_m", "time_ms", "surface_m", "drift_m")}
+    (sequences, others), times, surfaces, drifts = parts.values()
+    found = [trajectory_table(sequences), time_table(times[0]), refinement_table(sequences), surface_table(surfaces[0]), drift_table(drifts[0])]
+    found += [other_trajectory_table(others), time_table(times[1], False), refinement_table(others, False)]
+    found += [surface_table(surfaces[1], False), drift_table(drifts[1], False)]
     return [one for one in found if one is not None]
 
 
+def _part(known: Known, figure: str, of_paper: bool) -> Known:
+    """Return the rows on sequences that the paper has this figure of, or all others. Its times are of no single sequence."""
+    names = published.sequences() if figure == "time_ms" else published.paper()[figure]
+    return [(facts, row) for facts, row in known if (published.sequence_of(facts.folder_name) in names) == of_paper]
+
+
 def trajectory_table(known: Known) -> Table:
-    """Table I: ATE RMSE in mm of our systems and the published ones, a row a sequence of the paper."""
-    graphs = _graphs(known)
+    """Table I: ATE RMSE in mm of our systems and the published ones, a row a sequence of the paper, or each of our data of that sequence."""
+    columns, cells = _errors_by_data(known)
     systems = published.paper()["ate_m"]["systems"]
     rows = []
     for sequence, entry in published.sequences().items():
         if sequence not in published.paper()["ate_m"]:
             continue
-        of_it = {facts.graph: (facts, row) for facts, row in known if published.sequence_of(facts.folder_name) == sequence}
-        ours = [figure_text(of_it[graph][1], COMPARED) if graph in of_it else NONE for graph in graphs]
         values = [NONE if value is None else f"{1e3 * value:g}" for value in published.paper()["ate_m"][sequence]]
-        note = f"trihedron download {entry['download']}"
-        if of_it:
-            frames = max(facts.frames for facts, _ in of_it.values())
-            note = "whole" if frames >= published.WHOLE * entry["frames"] else f"{frames} of about {entry['frames']} frames: not comparable"
-        rows.append((sequence, *ours, *values, note))
-    header = ("sequence", *graphs, *(f"{name}¹" for name in systems), "frames, or how to get them")
+        of_it = {data: found for data, found in cells.items() if published.sequence_of(found[0].folder_name) == sequence}
+        for data, (facts, ours) in of_it.items():
+            whole = facts.frames >= published.WHOLE * entry["frames"]
+            note = "whole" if whole else f"{facts.frames} of about {entry['frames']} frames: not comparable"
+            rows.append((sequence if len(of_it) == 1 else f"{sequence}, {data}", *ours, *values, note))
+        if not of_it:
+            rows.append((sequence, *[NONE] * len(columns), *values, f"trihedron download {entry['download']}"))
+    header = ("sequence", *columns, *(f"{name}¹" for name in systems), "frames, or how to get them")
     return Table(
         "Table I: trajectory error",
         "ATE RMSE in mm; - is not there, not published, or lost. ¹ as published. Last column: how to get a sequence that is not there.",
@@ -113,79 +127,88 @@ def trajectory_table(known: Known) -> Table:
     )
 
 
-def time_table(known: Known) -> Table | None:
+def other_trajectory_table(known: Known) -> Table | None:
+    """Return the ATE of our systems on data that the paper has not."""
+    columns, cells = _errors_by_data(known)
+    rows = [(data, *ours, str(facts.frames)) for data, (facts, ours) in cells.items() if set(ours) != {NONE}]
+    return Table(f"{OTHER}: trajectory error", "ATE RMSE in mm.", ("data", *columns, "frames"), tuple(rows)) if rows else None
+
+
+def _errors_by_data(known: Known) -> tuple[list[str], dict[str, tuple[RunFacts, list[str]]]]:
+    """Return the labels of the systems, and of each data, by its label, the run of most frames and a text for each system."""
+    facts = [one for one, _ in known]
+    systems, data = system_labels(facts), data_labels(facts)
+    columns = list(dict.fromkeys(systems))
+    texts = {place: figure_text(row, COMPARED) for place, (_, row) in zip(zip(data, systems), known)}
+    longest = {name: max((one for one, other in zip(facts, data) if other == name), key=lambda one: one.frames) for name in data}
+    return columns, {name: (longest[name], [texts.get((name, system), NONE) for system in columns]) for name in longest}
+
+
+def time_table(known: Known, of_paper: bool = True) -> Table | None:
     """Table II: median ms of the stages, by the paper's groups."""
+    timings = [(facts, read_json(facts.run.folder / "timing.json")) for facts, _ in known if facts.graph in ("structural", WITH)]
+    timed = [(facts, timing) for facts, timing in timings if timing.get("stages")]
     rows = []
-    for facts, _ in known:
-        timing = read_json(facts.run.folder / "timing.json")
-        stages = timing.get("stages", {})
-        if facts.graph not in ("structural", WITH) or not stages:
-            continue
-        groups = [sum((stages.get(name) or {}).get("p50_ms") or 0.0 for name in names) for names in STAGE_GROUPS.values()]
+    for label, (_, timing) in zip(row_labels([facts for facts, _ in timed]), timed):
+        groups = [sum((timing["stages"].get(name) or {}).get("p50_ms") or 0.0 for name in names) for names in STAGE_GROUPS.values()]
         total = (timing.get("frame_ms") or {}).get("p50")
-        rows.append((f"{facts.graph}, {_data(facts)}", *(f"{ms:.1f}" for ms in groups), NONE if total is None else f"{total:.1f}"))
+        rows.append((label, *(f"{ms:.1f}" for ms in groups), NONE if total is None else f"{total:.1f}"))
     if not rows:
         return None
-    median = published.paper()["time_ms"]["median"]
-    rows.append(("paper, TUM RGB-D", *(f"{ms:.1f}" for ms in median)))
-    note = f"Median ms: sums of the stages' medians; total is a frame's latency. The paper's machine: {published.paper()['machine']}."
-    return Table("Table II: time per stage", note, ("system", *STAGE_GROUPS, "total"), tuple(rows))
+    header, note = ("system", *STAGE_GROUPS, "total"), "Median ms: sums of the stages' medians; total is a frame's latency."
+    if not of_paper:
+        return Table(f"{OTHER}: time per stage", note, header, tuple(rows))
+    rows.append(("paper, TUM RGB-D", *(f"{ms:.1f}" for ms in published.paper()["time_ms"]["median"])))
+    return Table("Table II: time per stage", f"{note} The paper's machine: {published.paper()['machine']}.", header, tuple(rows))
 
 
-def refinement_table(known: Known) -> Table | None:
-    """Return the ATE with and without refinement, and the published one."""
-    by_data: dict[str, dict[str, dict[str, Any]]] = {}
-    names: dict[str, RunFacts] = {}
+def refinement_table(known: Known, of_paper: bool = True) -> Table | None:
+    """Return the ATE with and without refinement of runs that are alike in all else, and the published one."""
+    pairs: dict[tuple[str, str], dict[str, tuple[RunFacts, dict[str, Any]]]] = {}
     for facts, row in known:
-        if facts.graph in (WITH, WITHOUT):
-            by_data.setdefault(row["data"], {})[facts.graph] = row
-            names[row["data"]] = facts
+        if facts.graph in (WITH, WITHOUT) and COMPARED in row["figures"]:
+            alike = " ".join(word for word in row["change"].split() if not word.startswith("graph="))
+            pairs.setdefault((row["data"], alike), {})[facts.graph] = (facts, row)
+    found = [pair for pair in pairs.values() if set(pair) == {WITH, WITHOUT}]
+    with_it = [pair[WITH][0] for pair in found]
+    several = len(set(system_labels(with_it))) > 1
     rows = []
-    for data, found in by_data.items():
-        if set(found) != {WITH, WITHOUT} or any(COMPARED not in row["figures"] for row in found.values()):
-            continue
-        with_mm, without_mm = (found[graph]["figures"][COMPARED]["median"] for graph in (WITH, WITHOUT))
-        sequence = published.sequence_of(names[data].folder_name) or ""
+    for pair, label in zip(found, row_labels(with_it) if several else data_labels(with_it)):
+        with_mm, without_mm = (pair[graph][1]["figures"][COMPARED]["median"] for graph in (WITH, WITHOUT))
+        sequence = published.sequence_of(pair[WITH][0].folder_name) or ""
         paper = [published.published_ate_m(sequence, graph) for graph in (WITH, WITHOUT)]
-        texts = [NONE if value is None else f"{1e3 * value:g}" for value in paper]
-        rows.append((_data(names[data]), *(figure_text(found[graph], COMPARED) for graph in (WITH, WITHOUT)), f"{without_mm / with_mm:.2f}", *texts))
-    header = ("data", "with refinement", "without", "ratio", "paper: with", "paper: without")
-    return Table("Effect of refinement", "ATE RMSE in mm.", header, tuple(rows)) if rows else None
+        texts = [NONE if value is None else f"{1e3 * value:g}" for value in paper] if of_paper else []
+        rows.append((label, *(figure_text(pair[graph][1], COMPARED) for graph in (WITH, WITHOUT)), f"{without_mm / with_mm:.2f}", *texts))
+    header = ("data", "with refinement", "without", "ratio", *(("paper: with", "paper: without") if of_paper else ()))
+    return Table("Effect of refinement" if of_paper else f"{OTHER}: effect of refinement", "ATE RMSE in mm.", header, tuple(rows)) if rows else None
 
 
-def surface_table(known: Known) -> Table | None:
+def surface_table(known: Known, of_paper: bool = True) -> Table | None:
     """Return error and size of the surfaces that were judged."""
+    judged = [(facts, row) for facts, row in known if (facts.run.folder / "surface.ply").is_file() and "surface mm" in row["figures"]]
     rows = []
-    for facts, row in known:
-        file = facts.run.folder / "surface.ply"
-        if file.is_file() and "surface mm" in row["figures"]:
-            size = f"{file.stat().st_size / 1e6:.2f}"
-            sequence = published.sequence_of(facts.folder_name)
-            paper = published.paper()["surface_m"].get(sequence)
-            ours = NONE if paper is None else f"{1e3 * paper[-1]:g}"
-            rows.append((f"{facts.graph}, {_data(facts)}", figure_text(row, "surface mm"), figure_text(row, "within 5 cm %"), size, ours))
-    header = ("system", "mean mm", "within 5 cm %", "MB", "paper: mean mm")
+    for label, (facts, row) in zip(row_labels([facts for facts, _ in judged]), judged):
+        size = f"{(facts.run.folder / 'surface.ply').stat().st_size / 1e6:.2f}"
+        paper = published.paper()["surface_m"].get(published.sequence_of(facts.folder_name))
+        texts = [NONE if paper is None else f"{1e3 * paper[-1]:g}"] if of_paper else []
+        rows.append((label, figure_text(row, "surface mm"), figure_text(row, "within 5 cm %"), size, *texts))
+    header = ("system", "mean mm", "within 5 cm %", "MB", *(("paper: mean mm",) if of_paper else ()))
+    title = "Surface: error and size" if of_paper else f"{OTHER}: surface, error and size"
     note = "Mean distance from the true surface, share of it within 5 cm, size of surface.ply."
-    return Table("Surface: error and size", note, header, tuple(rows)) if rows else None
+    return Table(title, note, header, tuple(rows)) if rows else None
 
 
-def drift_table(known: Known) -> Table | None:
+def drift_table(known: Known, of_paper: bool = True) -> Table | None:
     """Return the drift at the end of long walks, in m and % of the path; of walks without ground truth the distance of the end from the start."""
+    walks = [(facts, drift) for facts, _ in known if (drift := _drift(facts)) is not None]
     rows = []
-    for facts, _ in known:
-        found = _drift(facts)
-        if found is None:
-            continue
-        drift_m, length_m = found
-        sequence = published.sequence_of(facts.folder_name) or ""
-        paper = published.paper()["drift_m"].get(sequence)
-        texts = [NONE, NONE] if paper is None else [f"{value:g}" for value in paper]
-        rows.append((f"{facts.graph}, {_data(facts)}", f"{length_m:.1f}", f"{drift_m:.4f}", f"{100.0 * drift_m / length_m:.3f}", *texts))
-    header = ("system", "path m", "drift m", "% of the path", "paper: Ours m", "paper: ORB-SLAM2 m")
-    note = (
-        f"Walks of at least {LONG_PATH_M:g} m. Where there is none: trihedron run -m graph=structural,structural_paper,points dataset.scene=corridor"
-    )
-    return Table("Drift of long walks", note, header, tuple(rows)) if rows else None
+    for label, (facts, (drift_m, length_m)) in zip(row_labels([facts for facts, _ in walks]), walks):
+        paper = published.paper()["drift_m"].get(published.sequence_of(facts.folder_name))
+        texts = ([NONE, NONE] if paper is None else [f"{value:g}" for value in paper]) if of_paper else []
+        rows.append((label, f"{length_m:.1f}", f"{drift_m:.4f}", f"{100.0 * drift_m / length_m:.3f}", *texts))
+    header = ("system", "path m", "drift m", "% of the path", *(("paper: Ours m", "paper: ORB-SLAM2 m") if of_paper else ()))
+    title = "Drift of long walks" if of_paper else f"{OTHER}: drift of long walks"
+    return Table(title, f"Walks of at least {LONG_PATH_M:g} m.", header, tuple(rows)) if rows else None
 
 
 def _drift(facts: RunFacts) -> tuple[float, float] | None:
@@ -208,18 +231,3 @@ def _drift(facts: RunFacts) -> tuple[float, float] | None:
     motion, true_motion = (invert(found[ends[0]]) @ found[ends[1]] for found, ends in ((poses, pairs[[0, -1], 0]), (truth.poses, pairs[[0, -1], 1])))
     error_m = float(np.linalg.norm(motion[:3, 3] - true_motion[:3, 3]))
     return (error_m, length_m) if math.isfinite(error_m) else None
-
-
-def _graphs(known: Known) -> list[str]:
-    """Return the graphs of runs on sequences of the paper; of all runs where there is none."""
-    there = [facts.graph for facts, _ in known if published.sequence_of(facts.folder_name)]
-    return list(dict.fromkeys(there or [facts.graph for facts, _ in known]))
-
-
-def _data(facts: RunFacts) -> str:
-    """Return a short name of a run's data: its folder, else the words of the data set without its name, seed and length."""
-    skipped = ("dataset", "dataset.seed", "dataset.length", "dataset.frames")
-    words = [
-        f"{key.removeprefix('dataset.')}={value}" for key, value in facts.run.overrides.items() if key.startswith("dataset") and key not in skipped
-    ]
-    return facts.folder_name or " ".join(["room", *words])

@@ -54,7 +54,8 @@ NOT_REPEATED = ("out", "hydra.sweep.dir")  # of the words of a command
 
 @dataclass(frozen=True)
 class RunFacts:
-    """A run with what its recording and configuration tell: commit, program version, words of its command, graph, data and number of frames."""
+    """A run with what its files tell: commit, program version, words of its command, graph, data, number of frames, and the median σ of the positions
+    of its poses with the status ok, NaN where it states none."""
 
     run: Run
     commit: str
@@ -62,6 +63,7 @@ class RunFacts:
     words: tuple[str, ...]
     config: dict[str, Any]
     frames: int
+    sigma_mm: float = np.nan
 
     @property
     def _dataset(self) -> dict[str, Any]:
@@ -72,6 +74,11 @@ class RunFacts:
     def folder_name(self) -> str:
         """Return the name of the data set's folder; empty for the synthetic room."""
         return Path(str(self._dataset.get("path") or "")).name
+
+    @property
+    def data_name(self) -> str:
+        """Return the name of the data set's folder, or the scene of the simulation."""
+        return self.folder_name or str(self._dataset.get("scene") or self._dataset.get("plugin") or "data")
 
     @property
     def data_set(self) -> str:
@@ -103,7 +110,8 @@ def facts_of(run: Run) -> RunFacts:
         words = recording.overrides()
     except (DataError, RecordingError):
         pass  # a run that failed has none, or a broken one
-    return RunFacts(run, commit, version, tuple(words), config, metrics.get("frames") or 0)
+    sigma_m = (metrics.get("sigma") or {}).get("median_m")
+    return RunFacts(run, commit, version, tuple(words), config, metrics.get("frames") or 0, np.nan if sigma_m is None else 1e3 * sigma_m)
 
 
 @dataclass(frozen=True)
@@ -225,6 +233,7 @@ def _summary(facts: RunFacts) -> list[tuple[str, str]]:
     import math
 
     figures = [(name, f"{value:.{FIGURES[name].decimals}f}") for name, value in facts.run.figures.items() if math.isfinite(value)]
+    figures += [("σ mm", f"{facts.sigma_mm:.2f}")] if math.isfinite(facts.sigma_mm) else []
     note = [("note", facts.run.note)] if facts.run.note else []
     return [
         ("data", facts.data_set),

@@ -19,9 +19,9 @@ FAR, KT3 = "/data/tum_fr3_structure_notexture_far", "/data/icl_nuim_of_kt3"
 STAGES = {"normals": 3.0, "keypoints": 5.0, "lines": 2.0, "segments": 0.5, "planes": 4.0, "manhattan": 0.5, "tracks": 1.0, "rotation": 0.5}
 
 
-def write_run(folder: Path, graph: str, path: str, ate_m: float, frames: int) -> None:
+def write_run(folder: Path, graph: str, path: str, ate_m: float, frames: int, *words: str) -> None:
     (folder / ".hydra").mkdir(parents=True)
-    (folder / ".hydra" / "overrides.yaml").write_text(yaml.safe_dump([f"graph={graph}", "dataset=tum", f"dataset.path={path}"]))
+    (folder / ".hydra" / "overrides.yaml").write_text(yaml.safe_dump([f"graph={graph}", "dataset=tum", f"dataset.path={path}", *words]))
     (folder / ".hydra" / "config.yaml").write_text(yaml.safe_dump({"dataset": {"plugin": "tum", "path": path}}))
     (folder / "metrics.json").write_text(json.dumps({"frames": frames, "final": {"ate_rmse_m": ate_m, "tracked_share": 1.0}}))
     stages = STAGES | {"translation": 1.0, "matches": 0.5, "pose": 2.0}
@@ -71,9 +71,45 @@ def test_drift_is_that_of_the_end_against_the_start(runs: Path) -> None:
     writer = RecordingWriter(runs / "2" / "run.mcap", {"version": "0", "commit": "", "overrides": "[]", "config": ""})
     writer.attach(TRUTH, format_trajectory(truth))
     writer.close()
-    known = paper.known_of([runs])
-    table = paper.drift_table(known)
-    assert table is not None and table.rows == (("structural, icl_nuim_of_kt3", "40.0", "0.0500", "0.125", "-", "-"),)
+    [table] = [table for table in paper.tables_of(paper.known_of([runs])) if "rift" in table.title]
+    assert table.title == "Other data: drift of long walks"  # the paper has the drift of no such sequence
+    assert table.rows == (("structural, icl_nuim_of_kt3", "40.0", "0.0500", "0.125"),)
+
+
+def test_variants_of_a_graph_have_columns_and_rows_of_their_own(tmp_path: Path) -> None:
+    for number, (graph, words) in enumerate([(g, w) for g in ("structural_paper", "structural_no_refine") for w in ((), ("planes=cape",))]):
+        write_run(tmp_path / str(number), graph, FAR, 0.007 + 0.001 * number, 818, *words)
+    tables = {table.title: table for table in paper.tables_of(paper.known_of([tmp_path]))}
+    first = tables["Table I: trajectory error"]
+    assert first.header[1:5] == ("structural_paper", "structural_paper planes=cape", "structural_no_refine", "structural_no_refine planes=cape")
+    assert [row[1:5] for row in first.rows if row[0] == "snot-far"] == [("7.00", "8.00", "9.00", "10.00")]
+    name = "tum_fr3_structure_notexture_far"
+    assert [row[0] for row in tables["Table II: time per stage"].rows[:-1]] == [f"default, {name}", f"planes=cape, {name}"]
+    assert [row[:4] for row in tables["Effect of refinement"].rows] == [
+        (f"default, {name}", "7.00", "9.00", "1.29"),
+        (f"planes=cape, {name}", "8.00", "10.00", "1.25"),
+    ]
+
+
+def test_two_runs_of_a_sequence_have_rows_of_their_own(tmp_path: Path) -> None:
+    write_run(tmp_path / "0", "structural_paper", FAR, 0.007, 818)
+    write_run(tmp_path / "1", "structural_paper", FAR, 0.005, 100, "dataset.frames=0:100")
+    [first, *_] = paper.tables_of(paper.known_of([tmp_path]))
+    rows = {row[0]: (row[1], row[-1]) for row in first.rows if row[0].startswith("snot-far")}
+    name = "snot-far, tum_fr3_structure_notexture_far"
+    assert rows == {name: ("7.00", "whole"), f"{name} frames=0:100": ("5.00", "100 of about 818 frames: not comparable")}
+
+
+def test_other_data_have_tables_of_their_own(runs: Path) -> None:
+    write_run(runs / "3", "structural_paper", "/data/desk", 0.011, 90)
+    write_run(runs / "4", "structural_no_refine", "/data/desk", 0.022, 90)
+    tables = {table.title: table for table in paper.tables_of(paper.known_of([runs]))}
+    for title in ("Table I: trajectory error", "Table II: time per stage", "Effect of refinement"):
+        assert not any("desk" in row[0] for row in tables[title].rows)
+    assert tables["Other data: trajectory error"].header == ("data", "structural_paper", "structural_no_refine", "frames")
+    assert tables["Other data: trajectory error"].rows == (("desk", "11.00", "22.00", "90"),)
+    assert tables["Other data: time per stage"].rows == (("structural_paper, desk", "14.5", "2.0", "1.0", "2.5", "21.0"),)
+    assert tables["Other data: effect of refinement"].rows == (("desk", "11.00", "22.00", "2.00"),)
 
 
 def test_the_old_name_of_the_experiment_is_accepted_with_a_warning(capsys: pytest.CaptureFixture[str]) -> None:

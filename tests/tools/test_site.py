@@ -14,7 +14,7 @@ import yaml
 
 from trihedron.comparison.runs import read_runs
 from trihedron.pipeline.app.cli import main as trihedron
-from trihedron.pipeline.core.errors import DataError
+from trihedron.pipeline.core.errors import DataError, UsageError
 from trihedron.pipeline.record.reader import Recording
 from trihedron.tools import site
 
@@ -36,13 +36,16 @@ def pages(run: Path) -> Path:
     return out
 
 
-def fake(folder: Path, graph: str, path: str, ate_m: float | None, frames: int, tracked: float = 1.0, seed: int = 0) -> None:
+def fake(
+    folder: Path, graph: str, path: str, ate_m: float | None, frames: int, tracked: float = 1.0, seed: int = 0, words: tuple[str, ...] = ()
+) -> None:
     """A run folder of small files only, without a recording."""
     (folder / ".hydra").mkdir(parents=True)
-    (folder / ".hydra" / "overrides.yaml").write_text(yaml.safe_dump([f"graph={graph}", "dataset=tum", f"dataset.path={path}", f"seed={seed}"]))
+    overrides = [f"graph={graph}", "dataset=tum", f"dataset.path={path}", f"seed={seed}", *words]
+    (folder / ".hydra" / "overrides.yaml").write_text(yaml.safe_dump(overrides))
     (folder / ".hydra" / "config.yaml").write_text(yaml.safe_dump({"dataset": {"plugin": "tum", "path": path}}))
     final = {"ate_rmse_m": ate_m, "tracked_share": tracked} if ate_m is not None else None
-    (folder / "metrics.json").write_text(json.dumps({"frames": frames, "final": final}))
+    (folder / "metrics.json").write_text(json.dumps({"frames": frames, "final": final, "sigma": {"median_m": 0.001 * (1 + seed)}}))
 
 
 def badge(tmp_path: Path, *ates_m: float | None, graph: str = "structural_paper", path: str = FAR, frames: int = 818, tracked: float = 1.0) -> str:
@@ -67,6 +70,61 @@ def test_what_cannot_be_compared_states_why(tmp_path: Path) -> None:
     assert badge(tmp_path / "d", 0.022, graph="points") == "not comparable: the paper has no figure, or its system was lost"
     assert badge(tmp_path / "e", 0.022, graph="libraries") == "not comparable: the paper has no such system"
     assert badge(tmp_path / "f", None) == "not comparable: no error was computed"
+
+
+def test_rows_are_labelled_by_what_differs(tmp_path: Path) -> None:
+    for number, words in enumerate(([], ["planes=cape"], ["graph=structural"], ["planes=cape", "seed=1"])):
+        folder = tmp_path / str(number) / ".hydra"
+        folder.mkdir(parents=True)
+        (folder / "overrides.yaml").write_text(yaml.safe_dump(words))
+    runs = read_runs(tmp_path)
+    assert [(cell.system, len(cell.facts)) for cell in site.cells_of(runs)] == [("default", 1), ("planes=cape", 2), ("graph=structural", 1)]
+    assert [cell.system for cell in site.cells_of(runs[:1])] == ["structural"]
+
+
+@pytest.fixture
+def alternatives(tmp_path: Path) -> Path:
+    """Runs of three alternatives on one data set, three seeds each, and of one on another."""
+    noise = (0.0, 0.0003, -0.0002)
+    for words, more_m in (((), 0.0), (("planes=cape",), 0.005), (("planes=ahc",), 0.0)):
+        for seed in range(3):
+            ate_m = 0.010 + 0.001 * seed + more_m + (noise[seed] if words else 0.0)
+            fake(tmp_path / "runs" / f"{more_m}{len(words)}{seed}", "points", "/data/desk", ate_m, 100, seed=seed, words=words)
+    fake(tmp_path / "runs" / "other", "points", "/data/hall", 0.010, 100)
+    return tmp_path / "runs"
+
+
+def table_of(index: str, title: str) -> list[list[str]]:
+    """The texts of the cells of a group's table."""
+    part = index.split(f">{title}</h2>")[1].split("</table>")[0]
+    return [[re.sub("<.*?>", "", cell).strip() for cell in re.findall(r"<t[hd].*?>(.*?)</t[hd]>", row)] for row in part.split("<tr>")[1:]]
+
+
+def test_tables_have_sigma_spread_and_verdicts(alternatives: Path, tmp_path: Path) -> None:
+    assert site.main([str(alternatives), "--out", str(tmp_path / "out")]) == 0
+    index = (tmp_path / "out" / "index.html").read_text()
+    header, *rows = table_of(index, "desk")
+    assert header == ["system", "runs", "tracked %", "ATE mm", "σ mm†", "verdict on ATE‡", "against the paper"]
+    shown = {row[0]: row[3:6] for row in rows}
+    assert shown == {
+        "default": ["11.00 ±1.00", "2.00 ±1.00", "the baseline"],
+        "planes=ahc": ["11.30 ±0.90", "2.00 ±1.00", "no difference shown"],
+        "planes=cape": ["16.30 ±0.90", "2.00 ±1.00", "worse"],
+    }
+    line = "default against planes=cape: ATE 11.00 -&gt; 16.03 mm, +5.03 (95 %: +4.41 to +5.66), d 20.0: worse"
+    assert "<summary>Verdicts in all figures</summary><ul>" in index and f"<li>{line}</li>" in index
+    assert table_of(index, "hall")[0] == ["system", "runs", "tracked %", "ATE mm", "σ mm†", "against the paper"]  # nothing to compare with
+    for mark, meaning in site.NOTES.items():
+        assert f"<dt>{mark}</dt><dd>{meaning}</dd>" in index
+    assert "<dt>σ mm</dt><dd>1.00</dd>" in next((tmp_path / "out" / "runs").glob("*hall*")).read_text()
+
+
+def test_the_baseline_is_chosen_by_its_label(alternatives: Path, tmp_path: Path) -> None:
+    assert site.main([str(alternatives), "--out", str(tmp_path / "out"), "--baseline", "planes=cape"]) == 0
+    _, *rows = table_of((tmp_path / "out" / "index.html").read_text(), "desk")
+    assert {row[0]: row[5] for row in rows} == {"default": "better", "planes=ahc": "better", "planes=cape": "the baseline"}
+    with pytest.raises(UsageError, match=r"^--baseline: no row is 'planes=cap'; did you mean 'planes=cape'\?$"):
+        site.main([str(alternatives), "--out", str(tmp_path / "out"), "--baseline", "planes=cap"])
 
 
 def test_every_page_is_valid_and_needs_nothing_from_elsewhere(pages: Path) -> None:

@@ -93,9 +93,11 @@ def _cell(row: Row, name: str, best: str | None) -> Cell:
 
 def figure_text(row: Row, name: str) -> str:
     """Return the median of a row's figure ± half the distance from the smallest to the largest; - where there is none."""
-    if name not in row["figures"]:
-        return "-"
-    found, decimals = row["figures"][name], FIGURES[name].decimals
+    return spread_text(row["figures"][name], FIGURES[name].decimals) if name in row["figures"] else "-"
+
+
+def spread_text(found: dict[str, Any], decimals: int) -> str:
+    """Return a median ± half the distance from the smallest to the largest value, if there are several."""
     spread = f" ±{0.5 * (found['max'] - found['min']):.{decimals}f}" if found["runs"] > 1 else ""
     return f"{found['median']:.{decimals}f}{spread}"
 

@@ -134,8 +134,8 @@ def groups_of(runs: Sequence[Run]) -> dict[tuple[str, str], list[Run]]:
     varying = sorted(key for key in keys if len({run.overrides.get(key) for run in own}) > 1)
     groups: dict[tuple[str, str], list[Run]] = {}
     for run in runs:
-        change = run.label or _override_text(run, [k for k in varying if not _of_data(k)])
-        groups.setdefault((_override_text(run, [k for k in varying if _of_data(k)]), change), []).append(run)
+        change = run.label or _override_text(run, [k for k in varying if not is_of_data(k)])
+        groups.setdefault((_override_text(run, [k for k in varying if is_of_data(k)]), change), []).append(run)
     order = list(dict.fromkeys(data for data, _ in groups))
     return dict(sorted(groups.items(), key=lambda group: order.index(group[0][0])))
 
@@ -163,8 +163,7 @@ def row_of(data: str, change: str, same: Sequence[Run], base: Sequence[Run] | No
     for name in FIGURES:
         values = [run.figures[name] for run in same if np.isfinite(run.figures[name])]
         if values:
-            spread = {"median": float(np.median(values)), "min": min(values), "max": max(values), "runs": len(values)}
-            figures[name] = {**spread, "mean": float(np.mean(values)), "half": half_interval(values)}
+            figures[name] = {**spread_of(values), "mean": float(np.mean(values)), "half": half_interval(values)}
     notes = dict.fromkeys(run.note for run in same if run.note)
     return {
         "data": data,
@@ -177,15 +176,24 @@ def row_of(data: str, change: str, same: Sequence[Run], base: Sequence[Run] | No
     }
 
 
+def spread_of(values: Sequence[float]) -> dict[str, Any]:
+    """Return median, smallest and largest of the values of some runs, and their number."""
+    return {"median": float(np.median(values)), "min": min(values), "max": max(values), "runs": len(values)}
+
+
 def verdicts_against(runs: Sequence[Run], baseline: str) -> list[Verdict]:
     """Return the verdict of each change against the baseline in each figure, over all data and seeds that both have; none without a baseline."""
     groups = groups_of(runs) if baseline else {}
     pairs: dict[tuple[str, str], list[tuple[Sample, Sample]]] = {}
     for (data, change), same in groups.items():
-        for run, base in _pairs(same, groups.get((data, baseline), [])) if change != baseline else []:
-            samples = paired_samples(base.folder, run.folder, (base.figures, run.figures))
-            pairs.setdefault((baseline, change or "-"), []).append(samples)
+        if change != baseline:
+            pairs.setdefault((baseline, change or "-"), []).extend(samples_of(same, groups.get((data, baseline), [])))
     return verdicts_of(pairs, COLUMNS)
+
+
+def samples_of(runs: Sequence[Run], base: Sequence[Run]) -> list[tuple[Sample, Sample]]:
+    """Return the samples of the runs of one row that have the seeds of a run of the baseline's row, that run's first."""
+    return [paired_samples(other.folder, run.folder, (other.figures, run.figures)) for run, other in _pairs(runs, base)]
 
 
 def with_verdicts(rows: Sequence[dict[str, Any]], found: Sequence[Verdict]) -> list[dict[str, Any]]:
@@ -221,10 +229,17 @@ def _check_baseline(baseline: str, changes: Sequence[str]) -> None:
         raise UsageError("--baseline", f"no row is '{baseline}'", did_you_mean(baseline, {change for change in changes if change}))
 
 
-def _of_data(key: str) -> bool:
+def is_of_data(key: str) -> bool:
+    """Return True for the key of an option of the data set."""
     return key.partition(".")[0] == "dataset"
 
 
+def shown_words(run: Run) -> dict[str, str]:
+    """Return the overrides that tell a run's row from others, by key; of a path its last part."""
+    return {key: Path(value).name for key, value in run.overrides.items() if key not in NOT_SHOWN and value != "null"}
+
+
 def _override_text(run: Run, keys: Sequence[str]) -> str:
-    """Overrides of a run for these keys; of a path its last part."""
-    return " ".join(f"{key}={Path(run.overrides[key]).name}" for key in keys if run.overrides.get(key, "null") != "null")
+    """Overrides of a run for these keys."""
+    words = shown_words(run)
+    return " ".join(f"{key}={words[key]}" for key in keys if key in words)
