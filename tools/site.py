@@ -44,9 +44,9 @@ NOTES = {
     "±": "A figure is the median over the runs of a row, which differ in their seeds alone, ± half the distance from the smallest to the largest.",
     "†": "Median, over the poses with the status ok, of the σ that a run states of its positions: the root of the trace of their covariance, which"
     " compares with ATE.",
-    "‡": "Against the row that is the baseline: better, worse, equal or no difference shown, as trihedron compare --baseline states it, over the runs"
-    " with the same seeds or, of a single one, over its frames. In a table where nothing differs, the chance of any better or worse is 5 %."
-    " Below a table are the differences in all figures with their 95 % intervals.",
+    "‡": "Against the row that is the baseline: better, worse, equal, no difference shown or too short to tell, as trihedron compare --baseline"
+    " states it, over the runs with the same seeds or, of a single one, over its frames. In a table where nothing differs, the chance of any better"
+    " or worse is 5 %. Below a table are the differences in all figures with their 95 % intervals.",
 }
 
 

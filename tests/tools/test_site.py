@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import html
 import json
 import re
+import shutil
 import subprocess
 from pathlib import Path
 
@@ -34,6 +36,15 @@ def pages(run: Path) -> Path:
     out = run.parent / "results"
     assert site.main([str(run), "--out", str(out)]) == 0
     return out
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The pages of two alternatives with two seeds each."""
+    folder = tmp_path_factory.mktemp("study")
+    assert trihedron(["run", "-m", "planes=connected_components,cape", *SMALL, "dataset.seed=0,1", f"out={folder / 'runs'}"]) == 0
+    assert site.main([str(folder / "runs"), "--out", str(folder / "pages")]) == 0
+    return folder / "pages"
 
 
 def fake(
@@ -220,3 +231,26 @@ def test_small_rows_stay_in_their_band(tmp_path: Path, capsys: pytest.CaptureFix
     band = Path(__file__).with_name("small_rows_band.yaml")
     code = site.main([str(tmp_path / "runs"), "--no-pictures", "--out", str(tmp_path / "out"), "--check", str(band)])
     assert code == 0, capsys.readouterr().out
+
+
+TOLD = """<script>addEventListener("load", () => setTimeout(() => parent.postMessage(document.documentElement.scrollWidth, "*"), 1000))</script>"""
+FRAMED = """<script>addEventListener("message", (event) => { document.body.dataset.width = event.data; })</script>"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("details", ["closed", "open"])
+@pytest.mark.parametrize("kind", ["index", "run"])
+def test_no_page_scrolls_sideways_on_a_telephone(kind: str, details: str, study: Path, tmp_path: Path) -> None:
+    """At 400 pixels the page is 400 pixels wide: nothing but its own regions scrolls sideways, whatever is opened."""
+    browser = shutil.which("chromium") or shutil.which("google-chrome")
+    if browser is None:
+        pytest.skip("no chromium or google-chrome here; install it with: apt-get install chromium")
+    page = study / "index.html" if kind == "index" else sorted((study / "runs").glob("*.html"))[-1]
+    text = page.read_text().replace("</body>", TOLD + "</body>")
+    assert "<details>" in text
+    text = text.replace("<details>", "<details open>") if details == "open" else text
+    frame = tmp_path / "frame.html"
+    frame.write_text(f'<body>{FRAMED}<iframe style="width: 400px; border: 0" srcdoc="{html.escape(text)}"></iframe>')
+    options = ["--headless", "--no-sandbox", "--enable-unsafe-swiftshader", "--virtual-time-budget=8000", "--hide-scrollbars"]
+    done = subprocess.run([browser, *options, "--dump-dom", frame.as_uri()], capture_output=True, text=True, timeout=300)
+    assert re.search('<body data-width="400"', done.stdout)
