@@ -9,17 +9,18 @@ import foxglove
 from foxglove.websocket import ChannelView, Client, ServerListener
 
 from trihedron.pipeline.core.errors import ConfigError
+from trihedron.pipeline.record.origin_gate import OriginGate, hidden_address
 
 SHOWN = ("/view/", "/tf", "/error", "/timing")  # beginnings of the channels that are sent
 IN_PARTS = ("/view/path",)  # channels whose messages add to each other; of any other, the last one says all
 BACKLOG = 256  # messages that wait for a client
-CLOSING_S = 2.0  # that closing waits for clients to be disconnected
+CLOSING_S = 1.0  # that closing waits for clients to be disconnected
 LOOPBACK = "127.0.0.1"
 
 
 class FoxgloveServer(ServerListener):
-    """A server. What is logged to channels of its context is sent to each client that has subscribed. After the run's end a client that subscribes
-    gets what was last shown."""
+    """A server. What is logged to channels of its context is sent to each client that has subscribed, but no page of a foreign web site. After the
+    run's end a client that subscribes gets what was last shown."""
 
     def __init__(self, port: int, host: str = LOOPBACK) -> None:
         """Listen on the address `host` and a port, 0 for any that is free. Raises ConfigError where that cannot be."""
@@ -28,15 +29,17 @@ class FoxgloveServer(ServerListener):
         self._last_ns = 0
         self._ended = False
         try:
+            hidden = hidden_address()
             self._server = foxglove.start_server(
                 name="trihedron",
-                host=host,
-                port=port,
+                host=hidden,
+                port=0,
                 context=self.context,
                 channel_filter=_is_shown,
                 message_backlog_size=BACKLOG,
                 server_listener=self,
             )
+            self._gate = OriginGate((host, port), (hidden, self._server.port))
         except (RuntimeError, OSError, OverflowError) as error:
             cure = "give another view.port, 0 for any that is free"
             raise ConfigError("view.port", f"{port} cannot be opened: {error}", cure if host == LOOPBACK else f"{cure}, or view.host") from error
@@ -44,7 +47,7 @@ class FoxgloveServer(ServerListener):
     @property
     def url(self) -> str:
         """Return where a client connects."""
-        return f"ws://{self._host}:{self._server.port}"
+        return f"ws://{f'[{self._host}]' if ':' in self._host else self._host}:{self._gate.port}"
 
     def remember(self, channel: foxglove.Channel, log_time: int, data: bytes) -> None:
         """Hold what a channel was sent, for clients that come after the run."""
@@ -65,10 +68,11 @@ class FoxgloveServer(ServerListener):
             own.log(data, log_time=self._last_ns)
 
     def close(self) -> None:
-        """Disconnect all clients. One that connected and says nothing keeps the server from stopping: it is left to the end of the process."""
+        """Disconnect all clients, with a word of goodbye to those that listen."""
         stopping = threading.Thread(target=self._server.stop, daemon=True)
         stopping.start()
         stopping.join(CLOSING_S)
+        self._gate.close()
 
 
 def _is_shown(channel: Any) -> bool:

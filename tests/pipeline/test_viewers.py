@@ -20,6 +20,7 @@ from typing import Any
 import pytest
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
+from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 import trihedron as th
@@ -264,6 +265,29 @@ def test_a_client_that_says_nothing_does_not_hold_the_run() -> None:
         "silent = socket.create_connection(('127.0.0.1', int(server.url.rpartition(':')[2]))); server.close(); print('closed')"
     )
     assert subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60).stdout == "closed\n"
+
+
+@pytest.mark.parametrize(
+    "origin, allowed",
+    [
+        (None, True), ("http://localhost:8080", True), ("http://127.0.0.1:3000", True), ("https://app.foxglove.dev", True), ("file://", True),
+        ("https://example.org", False), ("https://notfoxglove.dev", False), ("http://app.foxglove.dev", False), ("null", False),
+        ("http://[", False), ("https://app.foxglove.dev.example.org", False),
+    ],
+)  # fmt: skip
+def test_a_page_of_a_foreign_site_cannot_read_the_stream(origin: str | None, allowed: bool) -> None:
+    server = FoxgloveServer(0)
+    try:
+        options: Any = {"origin": origin, "subprotocols": ["foxglove.sdk.v1"]}
+        if allowed:
+            with connect(server.url, **options) as client:
+                assert json.loads(client.recv())["name"] == "trihedron"
+        else:
+            with pytest.raises(InvalidStatus) as error:
+                connect(server.url, **options)
+            assert error.value.response.status_code == 403
+    finally:
+        server.close()
 
 
 TINY = ["dataset.width=160", "dataset.height=120", "dataset.length=6"]
