@@ -13,11 +13,12 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from trihedron.pipeline.core.files import write_file
+from trihedron.pipeline.core.geometry import upright
 from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F32, F64, I32, PLANE_KINDS, U8, Bool, Surface
 from trihedron.pipeline.record.reader import Recording
 from trihedron.tools.export import Format
-from trihedron.tools.export_surface import surface_of, upright
+from trihedron.tools.export_surface import surface_of
 
 SIZE = (1920, 1200)  # px, of the picture
 SUPERSAMPLING = 2  # pixels drawn for one of the picture, in each direction

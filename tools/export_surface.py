@@ -12,6 +12,7 @@ import numpy as np
 
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.files import write_file
+from trihedron.pipeline.core.geometry import upright
 from trihedron.pipeline.core.types import F64, PLANE_KINDS, Surface
 from trihedron.pipeline.record.reader import Recording
 from trihedron.plugins.surface.ply import triangle_planes, write_ply
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
 
 LOOK: dict[str, Any] = {"metallicFactor": 0.0, "roughnessFactor": 1.0, "doubleSided": True}
 UNLIT = "KHR_materials_unlit"  # the colours have the light of the place in them
-CAMERA_UP, CAMERA_AHEAD = np.array([0.0, -1.0, 0.0]), np.array([0.0, 0.0, 1.0])  # of the first frame, which is the world
 
 
 def surface_of(recording: Recording) -> Surface:
@@ -33,17 +33,6 @@ def surface_of(recording: Recording) -> Surface:
     if found is None:
         raise DataError(str(recording.path), "holds no surface", "run with 'outputs=[trajectory,surface]'")
     return found
-
-
-def upright(up: F64, axis: str = "z") -> F64:
-    """(3, 3) `R_file_world` for the up direction (3,) of the world, NaN = that of the first camera: up becomes `axis`."""
-    up = up / np.linalg.norm(up) if np.isfinite(up).all() else CAMERA_UP
-    ahead = CAMERA_AHEAD - (CAMERA_AHEAD @ up) * up
-    if np.linalg.norm(ahead) < 0.1:  # the first camera looked straight up or down
-        ahead = CAMERA_UP - (CAMERA_UP @ up) * up
-    ahead = ahead / np.linalg.norm(ahead)
-    right = np.cross(ahead, up)
-    return np.stack([right, ahead, up]) if axis == "z" else np.stack([right, up, -ahead])
 
 
 def _summary(surface: Surface) -> str:

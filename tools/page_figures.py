@@ -13,9 +13,9 @@ from markupsafe import Markup, escape
 from numpy.typing import NDArray
 
 from trihedron.pipeline.core.drawings import Solid
+from trihedron.pipeline.core.geometry import upright
 from trihedron.pipeline.core.types import DEGRADED, F64, LOST, OK, U8, Surface
 from trihedron.tools.export_picture import visible_triangles
-from trihedron.tools.export_surface import upright
 
 WIDTH, HEIGHT = 560, 240
 LEFT, RIGHT, TOP, BOTTOM = 52, 12, 12, 34

@@ -17,7 +17,7 @@ from trihedron.comparison.run_tables import FIGURES
 from trihedron.comparison.runs import Run
 from trihedron.pipeline.core.errors import DataError, RecordingError, TrihedronError
 from trihedron.pipeline.core.files import MAX_YAML_BYTES, YamlError, file_sha256, parse_yaml, read_text
-from trihedron.pipeline.core.geometry import transform, umeyama
+from trihedron.pipeline.core.geometry import transform, umeyama, upright
 from trihedron.pipeline.core.registry import drawing_of
 from trihedron.pipeline.core.types import F64, Building, Pose, Surface, Trajectory, Value
 from trihedron.pipeline.record.reader import Recording
@@ -25,7 +25,6 @@ from trihedron.pipeline.record.trajectories import attached_truth, read_trajecto
 from trihedron.pipeline.run.metrics import FEWEST_POSES, aligned_errors, associate
 from trihedron.pipeline.run.result_files import read_results
 from trihedron.plugins.building.files import floorplan_svg, summary
-from trihedron.tools.export_surface import upright
 from trihedron.tools.page_figures import (
     DASHES,
     TRUTH,

@@ -11,6 +11,7 @@ from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.linalg_kernels import polar_rotation
 from trihedron.pipeline.core.types import F64
 
+CAMERA_UP, CAMERA_AHEAD = np.array([0.0, -1.0, 0.0]), np.array([0.0, 0.0, 1.0])  # of the first frame, which is the world
 ROUNDING = 1e-12  # of RRᵀ - I, above which a rotation is made one again
 
 
@@ -111,6 +112,18 @@ def rotation_from_quaternion(q: F64) -> F64:
             [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
         ]
     )
+
+
+def upright(up: F64, axis: str = "z") -> F64:
+    """Return (3, 3) `R_file_world` for the up direction (3,) of the world, NaN = that of the first camera: up becomes `axis`, "z" or "y", and the
+    first camera looks along +y, or -z."""
+    up = up / np.sqrt((up * up).sum()) if np.isfinite(up).all() else CAMERA_UP
+    ahead = CAMERA_AHEAD - (CAMERA_AHEAD * up).sum() * up
+    if (ahead * ahead).sum() < 0.01:  # the first camera looked straight up or down
+        ahead = CAMERA_UP - (CAMERA_UP * up).sum() * up
+    ahead = ahead / np.sqrt((ahead * ahead).sum())
+    right = np.cross(ahead, up)
+    return np.stack([right, ahead, up]) if axis == "z" else np.stack([right, up, -ahead])
 
 
 def umeyama(estimate: F64, truth: F64) -> F64:

@@ -14,6 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from trihedron.pipeline.core.geometry import upright
 from trihedron.pipeline.core.types import F32, F64, I32, U8, Frame, Keypoints, LineSegments, ManhattanFrame, Planes, Segments, Surface
 
 WIDTH_PX = 320  # of a picture
@@ -34,9 +35,9 @@ def picture_of(value: object) -> U8 | None:
     return None
 
 
-def html_of(value: object, picture: U8 | None = None) -> str | None:
-    """Return a picture, by default that of the value, as HTML with the value's line below; None where there is no picture."""
-    picture = picture_of(value) if picture is None else picture
+def html_of(value: object) -> str | None:
+    """Return the picture of a value as HTML with its line below; None where there is no picture."""
+    picture = picture_of(value)
     if picture is None or picture.size == 0:
         return None
     line = html.escape(repr(value))
@@ -146,7 +147,7 @@ def _(value: Surface) -> U8 | None:
     if not len(value.triangles):
         return None
     vertices = value.vertices_m.astype(np.float64)
-    seen = np.einsum("vk,jk->vj", vertices, np.einsum("ij,jk->ik", VIEW, _upright(value.up)))
+    seen = np.einsum("vk,jk->vj", vertices, np.einsum("ij,jk->ik", VIEW, upright(value.up)))
     corners = seen[value.triangles]
     a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     facing = b[:, 0] * a[:, 1] - a[:, 0] * b[:, 1]  # twice the area in the picture, whose y points down
@@ -157,14 +158,6 @@ def _(value: Surface) -> U8 | None:
     for corner, color in zip(place(corners[front, :, :2]), colors.tolist()):
         cv2.fillConvexPoly(image, corner, color)
     return image
-
-
-def _upright(up: F64) -> F64:
-    """Return the rotation of the world into axes with z up; y of the first camera points down where up is not known."""
-    z = up if np.isfinite(up).all() else np.array([0.0, -1.0, 0.0])
-    x = np.cross([0.0, 0.0, 1.0] if abs(z[2]) < 0.9 else [0.0, 1.0, 0.0], z)
-    x /= np.sqrt((x * x).sum())
-    return np.stack([x, np.cross(z, x), z])
 
 
 def canvas_round(shapes: Sequence[F64]) -> tuple[U8, Callable[[F64], I32]]:

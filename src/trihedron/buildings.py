@@ -220,10 +220,10 @@ class Building:
         return repr(self.plan)
 
     def _repr_html_(self) -> str | None:
+        import trihedron.plugins.building.picture  # noqa: F401, whose picture is that of a plan
         from trihedron.pipeline.core.pictures import html_of
-        from trihedron.plugins.building.picture import picture_of_building
 
-        return html_of(self.plan, picture_of_building(self.plan))
+        return html_of(self.plan)
 
     def _point(self, thing: Any, place: str) -> tuple[F64, F64]:
         """Return a point (3,) in the building's frame and its covariance (3, 3)."""

@@ -16,12 +16,11 @@ from trihedron.comparison.surface_errors import mesh_errors
 from trihedron.comparison.surface_truth import Truth, truth_of
 from trihedron.datasets.simulation.synthetic import Synthetic
 from trihedron.pipeline.core.errors import DataError, UsageError
-from trihedron.pipeline.core.geometry import pose_matrix
+from trihedron.pipeline.core.geometry import pose_matrix, upright
 from trihedron.pipeline.core.types import Camera, Frame, Surface, Trajectory
 from trihedron.pipeline.record.writer import RecordingWriter
 from trihedron.plugins.surface.ply import write_ply
 from trihedron.tools import evaluate_surface, export, export_picture
-from trihedron.tools.export_surface import upright
 
 SQUARE = np.array([[0, 0, 0], [2, 0, 0], [2, 1, 0], [0, 1, 0]], float)
 TWO = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
