@@ -278,10 +278,8 @@ def _sweep(words: list[str], recorded: RecordedConfig | None) -> int:
     import hydra
 
     from trihedron.pipeline.core.config import register_configs, rewrite_error
-    from trihedron.pipeline.core.registry import load_packages
 
     os.environ["HYDRA_FULL_ERROR"] = "1"  # exceptions come to us instead of being printed
-    load_packages()
     register_configs(recorded)
     overrides = with_literal_paths(words, sweep=True)
     outcomes = _run_sweep(words)
