@@ -41,10 +41,20 @@ def realsense() -> Iterator[tuple[Any, Images]]:
     config.enable_stream(rs.stream.color, WIDTH, HEIGHT, rs.format.rgb8, FPS)
     config.enable_stream(rs.stream.depth, WIDTH, HEIGHT, rs.format.z16, FPS)
     profile = pipeline.start(config)
-    lens = profile.get_stream(rs.stream.color).as_video_stream_profile().get_intrinsics()
+    intrinsics = profile.get_stream(rs.stream.color).as_video_stream_profile().get_intrinsics()
     scale = 1.0 / profile.get_device().first_depth_sensor().get_depth_scale()
-    distortion = tuple(lens.coeffs) if any(lens.coeffs) else ()
-    camera = th.Camera(lens.width, lens.height, lens.fx, lens.fy, lens.ppx, lens.ppy, float(FPS), depth_scale=scale, distortion=distortion)
+    distortion = tuple(intrinsics.coeffs) if any(intrinsics.coeffs) else ()
+    camera = th.Camera(
+        intrinsics.width,
+        intrinsics.height,
+        intrinsics.fx,
+        intrinsics.fy,
+        intrinsics.ppx,
+        intrinsics.ppy,
+        float(FPS),
+        depth_scale=scale,
+        distortion=distortion,
+    )
 
     def images() -> Images:
         while True:

@@ -16,21 +16,21 @@ def system_labels(rows: Sequence[RunFacts]) -> list[str]:
     words = [{key: text for key, text in shown_words(row.run).items() if not is_of_data(key)} for row in rows]
     graphs = [row.graph for row in rows]
     named = len(set(graphs)) > 1 or all(found == words[0] for found in words)
-    return [label or DEFAULT for label in _told_apart(graphs if named else [""] * len(rows), words)]
+    return [label or DEFAULT for label in _with_differences(graphs if named else [""] * len(rows), words)]
 
 
 def data_labels(rows: Sequence[RunFacts]) -> list[str]:
     """Return the label of each row's data: the folder's name, or the scene of the simulation, and the words that differ between rows of that name."""
     words = [{key.removeprefix("dataset."): text for key, text in shown_words(row.run).items() if is_of_data(key)} for row in rows]
-    return _told_apart([row.data_name for row in rows], words)
+    return _with_differences([row.data_name for row in rows], words)
 
 
 def row_labels(rows: Sequence[RunFacts]) -> list[str]:
-    """Return the labels of rows that are told apart by system and data."""
+    """Return the label of each row: its system, and its data."""
     return [f"{system}, {data}" for system, data in zip(system_labels(rows), data_labels(rows))]
 
 
-def _told_apart(names: Sequence[str], words: Sequence[Mapping[str, str]]) -> list[str]:
+def _with_differences(names: Sequence[str], words: Sequence[Mapping[str, str]]) -> list[str]:
     """Return each name with the words, key=value, that differ between the rows of that name."""
     labels = []
     for name, own in zip(names, words):

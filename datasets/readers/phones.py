@@ -20,7 +20,7 @@ MAX_SIDE = 1 << 15
 
 
 @dataclass(frozen=True)
-class Lens:
+class ColorIntrinsics:
     """Intrinsics of the whole colour image in pixels, and its size; the depth image shows the same, smaller."""
 
     width: float

@@ -16,7 +16,7 @@ from trihedron.datasets.readers.association import Stamps
 from trihedron.datasets.readers.cameras import Calibration
 from trihedron.datasets.readers.images import MAX_BYTES, color_of
 from trihedron.datasets.readers.matrices import MAX_DIGITS, frame_stamps, trajectory_of
-from trihedron.datasets.readers.phones import Confidence, Lens, reduce, trusted
+from trihedron.datasets.readers.phones import ColorIntrinsics, Confidence, reduce, trusted
 from trihedron.datasets.readers.picture_headers import UnreadableImage
 from trihedron.datasets.readers.sequence import ImageSequence, SequenceReader
 from trihedron.pipeline.core.errors import DataError, printable
@@ -57,10 +57,10 @@ class Record3D(SequenceReader):
         try:
             width, height = (int(about.get(key, default)) for key, default in zip(("dw", "dh"), LIDAR))
             K, fps = [float(x) for x in about["K"]], float(about.get("fps", 30.0))
-            lens = Lens(float(about["w"]), float(about["h"]), K[0], K[4], K[6], K[7])  # column by column
+            intrinsics = ColorIntrinsics(float(about["w"]), float(about["h"]), K[0], K[4], K[6], K[7])  # column by column
         except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
             raise DataError(place, "does not describe a camera", CURE) from error
-        camera = lens.reduced(width, height, fps, place)
+        camera = intrinsics.reduced(width, height, fps, place)
 
         def color(path: Path) -> U8:
             return reduce(color_of(archive.read(path), str(path)), camera)

@@ -11,7 +11,7 @@ from trihedron.datasets.readers.association import count_unpaired
 from trihedron.datasets.readers.cameras import Calibration
 from trihedron.datasets.readers.images import read_depth, read_levels
 from trihedron.datasets.readers.matrices import files_by_number
-from trihedron.datasets.readers.phones import Confidence, Lens, reduce, trusted
+from trihedron.datasets.readers.phones import ColorIntrinsics, Confidence, reduce, trusted
 from trihedron.datasets.readers.sequence import ImageSequence, SequenceReader, first_size
 from trihedron.datasets.readers.video import Video
 from trihedron.pipeline.core.errors import DataError
@@ -44,7 +44,7 @@ class StrayScanner(SequenceReader):
         height, width = first_size([depths[numbers[row]] for row in rows], DEPTH_SCALE)
         fps = 1e9 / float(np.median(np.diff(poses.stamps_ns))) if len(numbers) > 1 else Camera.fps
         matrix = folder / "camera_matrix.csv"
-        camera = Lens(film.width, film.height, *_intrinsics(matrix)).reduced(width, height, fps, str(matrix))
+        camera = ColorIntrinsics(film.width, film.height, *_intrinsics(matrix)).reduced(width, height, fps, str(matrix))
 
         def color(path: Path) -> U8:
             return reduce(film.frame(int(path.name)), camera)

@@ -12,7 +12,7 @@ from trihedron.pipeline.core.errors import ConfigError
 from trihedron.pipeline.record.origin_gate import OriginGate, hidden_address
 
 SHOWN = ("/view/", "/tf", "/error", "/timing")  # beginnings of the channels that are sent
-IN_PARTS = ("/view/path",)  # channels whose messages add to each other; of any other, the last one says all
+IN_PARTS = ("/view/path",)  # channels whose messages add to each other; of any other, the last one replaces those before
 BACKLOG = 256  # messages that wait for a client
 CLOSING_S = 1.0  # that closing waits for clients to be disconnected
 LOOPBACK = "127.0.0.1"

@@ -1,6 +1,6 @@
 """A door before a WebSocket server of this machine: connections that pages of foreign web sites open are refused, all others are passed on.
 
-A browser lets any page open a WebSocket to any address, and says in the header `Origin` whose page it is. It is for the server to look at that
+A browser lets any page open a WebSocket to any address, and states in the header `Origin` whose page it is. It is for the server to look at that
 (RFC 6455, section 10.2), and foxglove-sdk does not. What stands behind the door listens on an address of its own that nobody can guess."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The program of rerun: its window, or a server of its web page with the data. A process, since only the program is told where to listen."""
+"""The program of rerun: its window, or a server of its web page with the data. A process, since only the program has an option for the address."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def _started(words: list[str], host: str, ports: list[int]) -> subprocess.Popen[
             while not all(_listens(host, port) for port in ports):
                 if process.poll() is not None or time.monotonic() > deadline:
                     log.seek(0)
-                    lines = log.read().decode(errors="replace").strip().splitlines() or ["it says nothing"]
+                    lines = log.read().decode(errors="replace").strip().splitlines() or ["it printed nothing"]
                     raise ConfigError("view", f"rerun does not open: {printable(lines[-1])}", "give another view.host or view.port")
                 time.sleep(0.05)
         except BaseException:

@@ -127,7 +127,7 @@ class FrozenStream:
         return self.period > 1 and self._length <= 2 * self.period
 
     def _count_image(self) -> None:
-        """Count how often an image came, when the next comes. One that is repeated while nothing changes tells nothing."""
+        """Count how often an image came, when the next comes. One that is repeated while nothing changes shows nothing."""
         self._images += self._first is not None
         if self.period > 1 or self._images < 2 or (self._length > 1 and not self._moved):
             return
