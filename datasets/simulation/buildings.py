@@ -26,8 +26,8 @@ class Building:
     walk: Walk
 
 
-def _rectangle(x: tuple[float, float], y: tuple[float, float]) -> tuple[tuple[float, float], ...]:
-    """Its corners, anticlockwise."""
+def rectangle(x: tuple[float, float], y: tuple[float, float]) -> tuple[tuple[float, float], ...]:
+    """Return the corners of a rectangle, anticlockwise."""
     return (x[0], y[0]), (x[1], y[0]), (x[1], y[1]), (x[0], y[1])
 
 
@@ -35,22 +35,22 @@ def _skirting(wall: Wall) -> Solid:
     return wall.mount_box(wall.length_m / 2.0, (0.0, 0.08), wall.length_m, 0.015, "plastic")
 
 
-def _lamps(places: list[tuple[float, float]], ceiling_m: float = HEIGHT_M) -> tuple[list[Solid], tuple[tuple[float, float, float], ...]]:
+def lamps_at(places: list[tuple[float, float]], ceiling_m: float = HEIGHT_M) -> tuple[list[Solid], tuple[tuple[float, float, float], ...]]:
     """Flat lamps on the ceiling, and where their light comes from."""
     solids = [box((x - 0.3, x + 0.3), (y - 0.3, y + 0.3), (ceiling_m - 0.1, ceiling_m), "plastic") for x, y in places]
     return solids, tuple((x, y, ceiling_m - 0.25) for x, y in places)
 
 
 def _building(x: float, y: float, solids: list[Solid], lamps: list[tuple[float, float]], walk: Walk) -> Building:
-    planes, faces = shell(_rectangle((0.0, x), (0.0, y)))
-    hanging, lights = _lamps(lamps)
+    planes, faces = shell(rectangle((0.0, x), (0.0, y)))
+    hanging, lights = lamps_at(lamps)
     return Building(Room(planes, faces, (*solids, *hanging), lights, DETAIL), walk)
 
 
 def corridor() -> Building:
     """A corridor 2 m wide around a block: 45.6 m along its middle, back to where it began."""
     x, y = 15.7, 11.1
-    south, east, north, west = walls_of(_rectangle((0.0, x), (0.0, y)))
+    south, east, north, west = walls_of(rectangle((0.0, x), (0.0, y)))
     inner_west, inner_north, inner_east, inner_south = walls_of(((2.0, 2.0), (2.0, y - 2.0), (x - 2.0, y - 2.0), (x - 2.0, 2.0)))
     solids = [box((2.0, x - 2.0), (2.0, y - 2.0), (0.0, HEIGHT_M), "wall")]
     solids += [_skirting(wall) for wall in (south, east, north, west, inner_west, inner_north, inner_east, inner_south)]
@@ -74,7 +74,9 @@ def _doorway(along_x: bool, across: tuple[float, float], span: tuple[float, floa
     return [box(part, across, z, "wall") if along_x else box(across, part, z, "wall") for part, z in pieces]
 
 
-def _wall_with_gaps(start: tuple[float, float], end: tuple[float, float], gaps: list[tuple[float, float, float, float]]) -> list[Solid]:
+def wall_with_gaps(
+    start: tuple[float, float], end: tuple[float, float], gaps: list[tuple[float, float, float, float]], thickness_m: float = WALL_M
+) -> list[Solid]:
     """A wall along the middle line from `start` to `end` with gaps (middle along it, width, bottom, top)."""
     a, b = np.array([*start, 0.0]), np.array([*end, 0.0])
     length = float(norm(b - a))
@@ -85,7 +87,7 @@ def _wall_with_gaps(start: tuple[float, float], end: tuple[float, float], gaps: 
         pieces += [(at, left, 0.0, HEIGHT_M), (left, right, top, HEIGHT_M), *([(left, right, 0.0, bottom)] if bottom else [])]
         at = right
     half = [
-        (a + along * (s + t) / 2.0 + UP * (low + high) / 2.0, np.array([(t - s) / 2.0, WALL_M / 2.0, (high - low) / 2.0]))
+        (a + along * (s + t) / 2.0 + UP * (low + high) / 2.0, np.array([(t - s) / 2.0, thickness_m / 2.0, (high - low) / 2.0]))
         for s, t, low, high in [*pieces, (at, length, 0.0, HEIGHT_M)]
     ]
     return [turned_box(centre, size, yaw, "wall") for centre, size in half]
@@ -96,20 +98,20 @@ def flat() -> Building:
     x, y = 8.0, 6.0
     door, window = (DOORWAY_M[0], 0.0, DOORWAY_M[1]), (1.0, 0.9, 2.0)
     solids = [box((5.0, x), (3.5, y), (0.0, HEIGHT_M), "wall"), box((0.0, 1.2), (5.0, y), (0.0, HEIGHT_M), "wall")]
-    solids += _wall_with_gaps((0.0, 3.55), (5.0, 3.55), [(1.4, *window), (3.6, *door)])
-    solids += _wall_with_gaps((5.05, 0.0), (5.05, 3.5), [(1.75, *door)])
+    solids += wall_with_gaps((0.0, 3.55), (5.0, 3.55), [(1.4, *window), (3.6, *door)])
+    solids += wall_with_gaps((5.05, 0.0), (5.05, 3.5), [(1.75, *door)])
     ajar, leaf = np.radians(75.0), np.array([0.42, 0.02, 1.02])
     hinge = np.array([5.12, 2.2, 1.02])
     solids.append(turned_box(hinge + leaf[0] * np.array([np.sin(ajar), np.cos(ajar), 0.0]), leaf, np.pi / 2.0 - float(ajar), "wood", "door", 3))
     solids.append(box((7.4, x), (0.3, 1.9), (0.0, 2.3), "wood", "drawers", 0))
-    south, _, _, _ = walls_of(_rectangle((0.0, 5.0), (0.0, 3.5)))
-    _, east, north, _ = walls_of(_rectangle((1.2, 5.0), (3.6, y)))
+    south, _, _, _ = walls_of(rectangle((0.0, 5.0), (0.0, 3.5)))
+    _, east, north, _ = walls_of(rectangle((1.2, 5.0), (3.6, y)))
     solids += (
         furniture_along(south, "picture 1.0, portrait 2.4, picture 4.0")
         + furniture_along(east, "picture 1.2")
         + furniture_along(north, "portrait 1.0, picture 2.4")
     )
-    solids += furniture_along(walls_of(_rectangle((0.0, 5.0), (0.0, 3.5)))[3], "picture 1.2, portrait 2.5")
+    solids += furniture_along(walls_of(rectangle((0.0, 5.0), (0.0, 3.5)))[3], "picture 1.2, portrait 2.5")
     path = [(2.2, 0.9), (4.2, 1.75), (5.9, 1.75), (6.7, 1.3), (6.8, 2.4), (5.9, 2.0), (4.2, 1.75), (3.6, 2.6), (3.6, 4.2), (4.3, 4.9), (2.6, 5.1)]
     path += [(1.0, 4.4), (1.8, 4.1), (3.6, 4.4), (3.6, 2.6), (1.4, 2.6), (0.9, 1.5)]
     return _building(x, y, solids, [(2.5, 1.7), (6.5, 1.7), (2.8, 4.6)], Walk(tuple(path), 0.5, 0.5))
@@ -120,10 +122,10 @@ def slanted_flat() -> Building:
     footprint = ((0.0, 0.0), (8.0, 0.0), (8.0, 5.0), (1.5, 4.0))
     planes, faces = shell(footprint)
     south, east, north, west = walls_of(footprint)
-    solids = _wall_with_gaps((3.6, -0.2), (4.8, 5.2), [(2.3, DOORWAY_M[0], 0.0, DOORWAY_M[1])])
+    solids = wall_with_gaps((3.6, -0.2), (4.8, 5.2), [(2.3, DOORWAY_M[0], 0.0, DOORWAY_M[1])])
     solids += furniture_along(south, "picture 1.5, portrait 5.6, picture 7.0") + furniture_along(east, "picture 1.2, portrait 3.4")
     solids += furniture_along(north, "portrait 1.6, picture 5.0") + furniture_along(west, "picture 1.2, portrait 2.8")
-    hanging, lights = _lamps([(2.5, 2.0), (6.2, 2.3)])
+    hanging, lights = lamps_at([(2.5, 2.0), (6.2, 2.3)])
     path = ((2.4, 1.0), (3.4, 1.9), (4.2, 2.05), (5.4, 1.6), (6.9, 1.1), (7.0, 3.6), (5.6, 3.4), (4.2, 2.05), (3.2, 2.6), (2.3, 3.1), (1.4, 1.6))
     return Building(Room(planes, faces, (*solids, *hanging), lights, DETAIL), Walk(path, 0.5, 0.5))
 
@@ -135,7 +137,7 @@ STEPS = 15
 def house() -> Building:
     """Two storeys of two rooms each, joined by a straight flight of stairs along the west wall; the hole in the slab has a parapet of 0.9 m."""
     x, y, top = 7.0, 6.0, UPPER_M + HEIGHT_M
-    footprint = _rectangle((0.0, x), (0.0, y))
+    footprint = rectangle((0.0, x), (0.0, y))
     planes, faces = shell(footprint, top)
     divide = _doorway(False, (4.0, 4.1), (0.0, y), 2.0)
     solids = [*divide, *(_lift_to_upper_floor(solid) for solid in _doorway(False, (4.0, 4.1), (0.0, y), 4.2))]
@@ -156,8 +158,8 @@ def house() -> Building:
         for solid in furniture_along(east, "picture 1.2, shelf 3.0, portrait 4.8") + furniture_along(west, "portrait 0.6, picture 3.4")
     ]
     solids += [_lift_to_upper_floor(solid) for solid in furniture_along(north, "cabinet 1.4, picture 1.4, picture 4.6, portrait 6.2")]
-    low, low_lights = _lamps([(2.5, 3.0), (5.5, 3.0)])
-    high, high_lights = _lamps([(2.5, 3.0), (5.5, 3.0)], top)
+    low, low_lights = lamps_at([(2.5, 3.0), (5.5, 3.0)])
+    high, high_lights = lamps_at([(2.5, 3.0), (5.5, 3.0)], top)
     room = Room(planes, faces, (*solids, *low, *high), (*low_lights, *high_lights), DETAIL, ((0.0, HEIGHT_M), (UPPER_M, top)))
     ground = [(2.0, 3.6), (2.6, 5.0), (3.2, 3.6), (3.4, 2.0), (4.7, 2.0), (5.8, 1.5), (6.1, 3.6), (5.2, 4.6), (4.7, 2.0), (3.4, 2.0), (2.4, 1.2)]
     upper = [(1.6, 5.2), (3.2, 4.2), (4.9, 4.2), (6.0, 4.8), (6.0, 2.2), (5.2, 1.2), (4.9, 4.2), (3.2, 4.2), (3.0, 1.6), (1.9, 1.2), (1.8, 4.4)]
@@ -179,7 +181,7 @@ def _office(west: float) -> list[Solid]:
     solids += [box(side, (2.1, 6.2), (0.0, HEIGHT_M), "wall") for side in ((x[0] - WALL_M, x[0]), (x[1], x[1] + WALL_M))]
     solids += [box(x, (6.1, 6.2), (0.0, HEIGHT_M), "wall")]
     solids += [box(x, y, (0.0, 0.004), "floor"), box(x, y, (HEIGHT_M - 0.004, HEIGHT_M), "ceiling")]
-    south, to_east, north, to_west = walls_of(_rectangle(x, y))
+    south, to_east, north, to_west = walls_of(rectangle(x, y))
     solids += furniture_along(south, "portrait 0.8, bin 3.6") + furniture_along(to_east, "shelf 1.5, picture 3.1")
     solids += furniture_along(north, "desk 1.4, window 1.4, globe 3.2") + furniture_along(to_west, "picture 1.0, sofa 2.7")
     return [_looking(solid, number) for number, solid in enumerate(solids)]
@@ -195,7 +197,7 @@ def offices() -> Building:
     x, first, second = 14.0, 1.6, 8.4
     gaps = ((0.0, first - WALL_M), (first + 4.0 + WALL_M, second - WALL_M), (second + 4.0 + WALL_M, x))
     blocks = [box(gap, (2.0, 6.2), (0.0, HEIGHT_M), "wall") for gap in gaps]
-    south, east, _, west = walls_of(_rectangle((0.0, x), (0.0, 2.0)))
+    south, east, _, west = walls_of(rectangle((0.0, x), (0.0, 2.0)))
     solids = [*blocks, *_office(first), *_office(second), _skirting(south), _skirting(east), _skirting(west)]
     solids += furniture_along(south, "door 1.2, picture 2.7, portrait 4.4, door 6.0, picture 7.4, door 9.4, portrait 10.6, picture 11.8, door 13.2")
     solids += furniture_along(east, "window 1.0") + furniture_along(west, "picture 1.0")
@@ -237,7 +239,7 @@ def rooms() -> Building:
             solids += _doorway(False, (k * pitch - WALL_M, k * pitch), span, at)
     for number, plans in enumerate(ROOMS):
         row, k = divmod(number, 5)
-        south, east, north, west = walls_of(_rectangle((k * pitch, k * pitch + width), (row * (depth + WALL_M), row * (depth + WALL_M) + depth)))
+        south, east, north, west = walls_of(rectangle((k * pitch, k * pitch + width), (row * (depth + WALL_M), row * (depth + WALL_M) + depth)))
         sides = (south, east, north, west) if row == 0 else (north, east, south, west)  # the furniture stands along the outer wall
         for wall, plan in zip(sides, plans):
             solids += furniture_along(wall, plan)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import Enum
 from functools import cache, cached_property, lru_cache
@@ -13,6 +14,7 @@ from trihedron.datasets.readers.sequence import clip_range
 from trihedron.datasets.simulation import buildings
 from trihedron.datasets.simulation.buildings import Building
 from trihedron.datasets.simulation.depth_noise import KINECT, STEREO, noisy_color, sensed_depth
+from trihedron.datasets.simulation.flats import random_flat
 from trihedron.datasets.simulation.furniture import curved_pieces
 from trihedron.datasets.simulation.motion import Motion, camera_pose
 from trihedron.datasets.simulation.raytracing import Geometry, geometry_of
@@ -29,7 +31,7 @@ from trihedron.pipeline.core.types import EXACT_DEPTH, F32, F64, I32, U8, Bool, 
 
 class Scene(Enum):
     """Scene that the camera is in: one furnished room, a corridor that ends where it began, two identical offices on a corridor, ten rooms in a
-    circuit, an L-shaped flat, two rooms with slanted walls, two storeys joined by stairs."""
+    circuit, an L-shaped flat, two rooms with slanted walls, two storeys joined by stairs, a furnished flat drawn by its number."""
 
     room = "room"
     corridor = "corridor"
@@ -38,6 +40,7 @@ class Scene(Enum):
     flat = "flat"
     slanted_flat = "slanted_flat"
     house = "house"
+    random_flat = "random_flat"
 
 
 class Sensor(Enum):
@@ -47,7 +50,7 @@ class Sensor(Enum):
     stereo = "stereo"
 
 
-BUILDINGS = {Scene.corridor: buildings.corridor, Scene.offices: buildings.offices, Scene.rooms: buildings.rooms,
+BUILDINGS: dict[Scene, Callable[[], Building]] = {Scene.corridor: buildings.corridor, Scene.offices: buildings.offices, Scene.rooms: buildings.rooms,
              Scene.flat: buildings.flat, Scene.slanted_flat: buildings.slanted_flat, Scene.house: buildings.house}  # fmt: skip
 SENSORS = {Sensor.kinect: KINECT, Sensor.stereo: STEREO}
 ROOM_FRAMES = 150  # of the room, whose walk never ends
@@ -60,7 +63,8 @@ class Synthetic:
     """A furnished room of 5 × 4 × 2.7 m, or a building, ray traced when a frame is asked for. Frame i depends on the fields and i alone."""
 
     frames: Frames = ""  # part to make, half open: A:B, A:, :B, every S-th A:B:S; empty = all
-    scene: Scene = Scene.room  # room | corridor | offices | rooms | flat | slanted_flat | house
+    scene: Scene = Scene.room  # room | corridor | offices | rooms | flat | slanted_flat | house | random_flat
+    flat: NonNegativeInt = 0  # number of a random_flat
     length: NonNegativeInt = 0  # frames; 0 = the scene's own: 150 of the room, once round a building (a longer walk goes on)
     fps: PositiveFloat = 30.0
     seed: NonNegativeInt = 0  # of textures, path and noise
@@ -80,6 +84,9 @@ class Synthetic:
             raise ValueError("slanted: only the room has slanted walls")
         if self.scene is not Scene.room and self.curved:
             raise ValueError("curved: only the room has these pieces")
+
+        if self.scene is not Scene.random_flat and self.flat:
+            raise ValueError("flat: only scene=random_flat has a number")
 
     def __len__(self) -> int:
         return len(self._range)
@@ -151,7 +158,7 @@ class Synthetic:
 
     @cached_property
     def _building(self) -> Building | None:
-        return _building_of(self.scene)
+        return _building_of(self.scene, self.flat)
 
     @cached_property
     def _length(self) -> int:
@@ -170,28 +177,28 @@ class Synthetic:
 
     @cached_property
     def _scene(self) -> tuple[Geometry, Atlas]:
-        return _paint_scene(self.scene, self.slanted, self.curved, self.texture, self.seed)
+        return _paint_scene(self.scene, self.flat, self.slanted, self.curved, self.texture, self.seed)
 
     @cached_property
     def _room(self) -> Room:
-        return _room_of(self.scene, self.slanted, self.curved)
+        return _room_of(self.scene, self.flat, self.slanted, self.curved)
 
 
 @cache
-def _building_of(scene: Scene) -> Building | None:
-    return BUILDINGS[scene]() if scene in BUILDINGS else None
+def _building_of(scene: Scene, flat: int) -> Building | None:
+    return random_flat(flat) if scene is Scene.random_flat else BUILDINGS[scene]() if scene in BUILDINGS else None
 
 
 @cache
-def _room_of(scene: Scene, slanted: bool, curved: bool) -> Room:
-    if (building := _building_of(scene)) is not None:
+def _room_of(scene: Scene, flat: int, slanted: bool, curved: bool) -> Room:
+    if (building := _building_of(scene, flat)) is not None:
         return building.room
     room = furnished_room(slanted)
     return replace(room, solids=(*room.solids, *curved_pieces())) if curved else room
 
 
 @lru_cache(maxsize=2)
-def _paint_scene(scene: Scene, slanted: bool, curved: bool, texture: bool, seed: int) -> tuple[Geometry, Atlas]:
+def _paint_scene(scene: Scene, flat: int, slanted: bool, curved: bool, texture: bool, seed: int) -> tuple[Geometry, Atlas]:
     """Shapes and textures of a scene: to paint them takes as long as a hundred small frames, and runs of one process share them."""
-    room = _room_of(scene, slanted, curved)
+    room = _room_of(scene, flat, slanted, curved)
     return geometry_of(room), bake(all_faces(room), texture, seed, room.detail)

@@ -26,6 +26,7 @@ class Walk:
     speed_m_s: float
     looking_ahead_m: float  # standard deviation of the Gaussian that smooths the heading along the path
     floors_m: tuple[float, ...] = ()
+    gaze_deg: Sway = GAZE_DEG  # yaw, pitch, roll about that
 
     @property
     def duration_s(self) -> float:
@@ -43,7 +44,7 @@ class Walk:
         phases = np.random.default_rng([seed, 1]).uniform(0.0, 2.0 * np.pi, size=(4, 3))
         x, y, yaw, floor = self._at(self.speed_m_s * time_s)
         position = np.array([x, y, HEIGHT_M + floor]) + STEPS_M.at(time_s, phases[0]) + TREMOR_M.at(time_s, phases[1])
-        angles = np.array([0.0, PITCH_DEG, 0.0]) + GAZE_DEG.at(time_s, phases[2]) + TREMOR_DEG.at(time_s, phases[3])
+        angles = np.array([0.0, PITCH_DEG, 0.0]) + self.gaze_deg.at(time_s, phases[2]) + TREMOR_DEG.at(time_s, phases[3])
         return looking(position, np.radians(angles) + np.array([yaw, 0.0, 0.0]))
 
     def _at(self, along_m: float) -> F64:

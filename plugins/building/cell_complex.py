@@ -13,8 +13,13 @@ from trihedron.pipeline.core.linalg import matmul, norm
 from trihedron.pipeline.core.types import F64, I32, Bool
 from trihedron.plugins.building.faces import Face
 from trihedron.plugins.building.free_space import CELL_M, FreeSpace
+from trihedron.plugins.building.jogs import THICKEST_M, parting_columns
 
-FREE_SHARE = 0.5  # of a cell, for which it may be inside
+OPEN_BORDER_M = 0.15  # area in m² that a metre of border without a wall costs
+UNSEEN = 0.25  # of the area of a cell that no ray passed, which counts against its being inside
+THIN_M = 0.38  # width of a cell that may be within a wall
+CAPACITY = 10_000  # of a square metre: capacities are whole numbers
+ON_LINE_M, LEAST_COSINE = 0.02, 0.9998  # of a stretch on the line of a face
 TALL_SHARE = 0.5  # of an edge between cells, for which it parts them
 
 
@@ -51,10 +56,11 @@ def cells_of(faces: list[Face], space: FreeSpace) -> Cells:
             if p != q:
                 sides[min(p, q), max(p, q)].append(number)
     edges = []
+    parting = [(face, parting_columns(face, faces)) for face in faces]
     for (p, q), pair in sides.items():
         if len(pair) == 2:
             a, b = np.array(p), np.array(q)
-            edges.append((pair[0], pair[1], _tall_share(faces, a, b), float(norm(b - a))))
+            edges.append((pair[0], pair[1], _tall_share(parting, a, b), float(norm(b - a))))
     return Cells(polygons, free, edges)
 
 
@@ -67,7 +73,7 @@ def _free_share(polygon: Any, space: FreeSpace) -> float:
     inside = grid[shapely.contains_xy(polygon, grid[:, 0], grid[:, 1])]
     if len(inside) == 0:
         inside = np.array([polygon.representative_point().coords[0]])
-    return float((space.at(inside) != 0).mean())
+    return float(space.within(inside).mean())
 
 
 def _steps(low: float, high: float) -> F64:
@@ -75,20 +81,53 @@ def _steps(low: float, high: float) -> F64:
     return low + (np.arange(count) + 0.5) * (high - low) / count
 
 
-def _tall_share(faces: list[Face], a: F64, b: F64) -> float:
-    """Return the greatest share of a stretch that one face covers with tall columns."""
-    direction = (b - a) / max(float(norm(b - a)), 1e-9)
-    best = 0.0
-    for face in faces:
-        if abs(float(matmul(direction, face.normal))) < 0.02 and abs(float(matmul(a + b, face.normal)) / 2.0 - face.offset_m) < 0.02:
+def _tall_share(parting: list[tuple[Face, Bool]], a: F64, b: F64) -> float:
+    """Return the greatest share of a stretch that the parting columns of one face cover: one on its line, or the other face of the wall whose face is
+    on its line elsewhere."""
+    direction, middle = (b - a) / max(float(norm(b - a)), 1e-9), (a + b) / 2.0
+    across = np.array([-direction[1], direction[0]])
+    faces = []  # the side they look to, where they are across the stretch, and the share
+    for face, columns in parting:
+        side = float(matmul(face.normal, across))
+        if abs(side) > LEAST_COSINE:
             t0, t1 = sorted((float(matmul(a, face.along)), float(matmul(b, face.along))))
-            best = max(best, face.share(t0, t1, face.tall))
+            faces.append((np.sign(side), np.sign(side) * face.offset_m - float(matmul(middle, across)), face.share(t0, t1, columns)))
+    best = max((share for _, at, share in faces if abs(at) < ON_LINE_M), default=0.0)
+    for side in {side for side, at, _ in faces if abs(at) < ON_LINE_M}:
+        behind = [(-side * at, share) for other, at, share in faces if other == -side and ON_LINE_M < -side * at < THICKEST_M]
+        nearer = [-side * at for other, at, share in faces if other == side and share > 0.0 and -side * at > ON_LINE_M]
+        best = max([best, *(share for depth, share in behind if not any(at < depth for at in nearer))])
     return best
 
 
-def free_cells(cells: Cells) -> Bool:
-    """Return the cells (n,) that are inside: those that rays passed."""
-    return np.asarray(cells.free >= FREE_SHARE, np.bool_)
+def inside_cells(cells: Cells) -> Bool:
+    """Return the cells (n,) that are inside: those that rays passed, and with them what was not seen and no wall parts from them. What is as thin as a
+    wall is solid where no ray passed."""
+    thin = np.array([polygon.buffer(-THIN_M / 2.0).is_empty for polygon in cells.polygons])
+    return cut_cells(cells, OPEN_BORDER_M, np.where(thin, 1.0, UNSEEN))
+
+
+def cut_cells(cells: Cells, open_border_m: float, unseen: F64 | float) -> Bool:
+    """Label the cells (n,) inside or outside together, by a minimum cut source - cells - sink (Boykov, Jolly, ICCV 2001): a cell that is outside costs
+    the area that rays passed, m²; one that is inside costs `unseen` times the area that they did not; a metre of border between both without a wall
+    costs `open_border_m`."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import breadth_first_order, maximum_flow
+
+    n = len(cells.polygons)
+    area = np.array([polygon.area for polygon in cells.polygons])
+    first, second, tall, length = np.array(cells.edges).reshape(-1, 4).T
+    numbers, border = np.arange(n), open_border_m * length * (1.0 - tall)
+    rows = np.concatenate([np.full(n, n), numbers, first, second]).astype(int)
+    columns = np.concatenate([numbers, np.full(n, n + 1), second, first]).astype(int)
+    capacity = np.concatenate([area * cells.free, unseen * area * (1.0 - cells.free), border, border])
+    graph = coo_matrix((np.rint(CAPACITY * capacity).astype(np.int32), (rows, columns)), shape=(n + 2, n + 2)).tocsr()
+    residual = graph - maximum_flow(graph, n, n + 1).flow
+    residual.data = np.maximum(residual.data, 0)
+    residual.eliminate_zeros()
+    inside = np.zeros(n + 2, np.bool_)
+    inside[breadth_first_order(residual, n, return_predecessors=False)] = True
+    return np.asarray(inside[:n], np.bool_)
 
 
 def components(cells: Cells, inside: Bool) -> list[I32]:

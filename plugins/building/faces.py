@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
@@ -21,7 +21,8 @@ TALL_M = 2.15  # above doors and most furniture
 BELOW_CEILING_M = 0.25
 SNAP_DEG = 3.0  # a direction nearer to an axis of the building is that axis
 BINS = 180  # of 1°
-SAME_FACE = 10  # cm: of two faces of one direction that are nearer to each other, the lesser is furniture
+PEAK = 3  # cm to both sides of a peak of the offsets
+SAME_FACE_M = 0.1  # of two faces of one direction and stretch that are nearer to each other, the lesser is furniture
 NEAR_FACE_M = 0.05
 LEAST_READINGS = 2  # for which a column reaches high
 HIGH_M = 1.5  # reached by a column that rays neither pass over nor get behind
@@ -40,6 +41,7 @@ class Face:
     count: I32
     tall: Bool  # (k,) columns that reach high
     members: I64  # its points in the evidence
+    known: Bool = field(default_factory=lambda: np.zeros(0, np.bool_))  # (k,) columns of walls for certain; none before `tall_furniture`
 
     @property
     def along(self) -> F64:
@@ -83,11 +85,12 @@ def _faces_along(evidence: Evidence, height: F64, normal: F64, members: I64, sto
     low = float(offsets[high].min()) - 0.1
     bins = np.bincount(((offsets[high] - low) / 0.01).astype(int), weight[high])
     smooth = sliding_sum(np.concatenate([bins, np.zeros(10)]), np.array([0.25, 0.5, 0.75, 1.0, 0.75, 0.5, 0.25]))
-    around = np.concatenate([np.full(SAME_FACE, -1.0), smooth, np.full(SAME_FACE, -1.0)])
-    found = []
-    for best in np.nonzero(smooth > 0.0)[0]:
+    padded = np.concatenate([np.full(PEAK, -1.0), smooth, np.full(PEAK, -1.0)])
+    peaks = [k for k in np.nonzero(smooth > 0.0)[0] if smooth[k] >= padded[k : k + 2 * PEAK + 1].max()]
+    found: list[Face] = []
+    for best in sorted(peaks, key=lambda k: -smooth[k]):
         near = np.abs(offsets[high] - (low + (best + 0.5) * 0.01)) < 0.03
-        if smooth[best] < around[best : best + 2 * SAME_FACE + 1].max() or not near.any():
+        if not near.any():
             continue
         offset = float(np.average(offsets[high][near], weights=weight[high][near]))
         close = np.nonzero(np.abs(offsets - offset) < NEAR_FACE_M)[0]
@@ -96,9 +99,19 @@ def _faces_along(evidence: Evidence, height: F64, normal: F64, members: I64, sto
         width = int(columns.max()) + 1
         count = np.bincount(columns * LEVELS + levels[close], minlength=width * LEVELS).reshape(width, LEVELS).astype(np.int32)
         reach = _close_gaps(_tall_columns(Face(normal, offset, start, count, np.zeros(len(count), np.bool_), members[close]), space, storey))
-        if _longest(reach) * CELL_M >= least_m:
-            found.append(Face(normal, offset, start, count, reach, members[close]))
+        face = Face(normal, offset, start, count, reach, members[close])
+        if longest_run(reach) * CELL_M >= least_m and not any(_hides(other, face) for other in found):
+            found.append(face)
     return found
+
+
+def _hides(greater: Face, lesser: Face) -> bool:
+    """Say if a face is furniture on a greater one, or its stray readings."""
+    away = abs(greater.offset_m - lesser.offset_m)
+    if away >= SAME_FACE_M:
+        return False
+    beside = [greater.share(lesser.start_m + CELL_M * a, lesser.start_m + CELL_M * b, greater.tall) for a, b in runs_of(lesser.tall)]
+    return away < NEAR_FACE_M or max(beside) > 0.2
 
 
 def _tall_columns(face: Face, space: FreeSpace, storey: Storey) -> Bool:
@@ -120,10 +133,15 @@ def _bits(levels: U32) -> Bool:
     return np.asarray((levels[:, None] >> np.arange(LEVELS, dtype=np.uint32)) & np.uint32(1), np.bool_)
 
 
-def _longest(columns: Bool) -> int:
-    """Return the length of the longest run of marked columns."""
+def runs_of(columns: Bool) -> list[tuple[int, int]]:
+    """Return begin and end of each run of marked columns."""
     ends = np.nonzero(np.diff(np.concatenate([[False], columns, [False]])))[0]
-    return int(np.diff(ends)[::2].max(initial=0))
+    return [(int(a), int(b)) for a, b in ends.reshape(-1, 2)]
+
+
+def longest_run(columns: Bool) -> int:
+    """Return the length of the longest run of marked columns."""
+    return max((b - a for a, b in runs_of(columns)), default=0)
 
 
 def _close_gaps(columns: Bool, gap: int = 2) -> Bool:

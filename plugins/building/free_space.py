@@ -10,6 +10,7 @@ from trihedron.pipeline.core.types import F64, Bool
 from trihedron.plugins.building.evidence import LEVEL_DEG, Evidence
 from trihedron.plugins.building.free_space_kernels import U32, carve_kernel
 from trihedron.plugins.building.levels import Storey
+from trihedron.plugins.shared.voxel_hash_kernels import I64
 
 CELL_M = 0.05  # of the plan of free space, and of stretches along a wall
 LEVEL_M = 0.1  # of heights
@@ -19,20 +20,38 @@ BESIDE_M = 1.0  # on stairs
 
 @dataclass(frozen=True)
 class FreeSpace:
-    """The levels that rays passed, a bit each, in cells (h, w) of CELL_M from `origin` (2,), and where the floor was seen (h, w)."""
+    """The levels that rays passed, a bit each, in cells (h, w) of CELL_M from `origin` (2,), where the floor was seen (h, w), and where furniture stands
+    that rays do not pass (h, w)."""
 
     origin: F64
     levels: U32
     floor: Bool
+    furniture: Bool
 
     def at(self, points: F64) -> U32:
         """Return the levels (n,) at points (n, 2); none outside."""
-        column, row = np.floor((points - self.origin) / CELL_M).astype(int).T
-        h, w = self.levels.shape
-        inside = (row >= 0) & (row < h) & (column >= 0) & (column < w)
+        row, column, inside = self._cells(points)
         out = np.zeros(len(points), np.uint32)
         out[inside] = self.levels[row[inside], column[inside]]
         return out
+
+    def within(self, points: F64) -> Bool:
+        """Say of points (n, 2) if rays passed there or furniture stands there."""
+        row, column, inside = self._cells(points)
+        out = self.at(points) != 0
+        out[inside] |= self.furniture[row[inside], column[inside]]
+        return out
+
+    def furnish(self, points: F64) -> None:
+        """Say of points (n, 2) that furniture stands there."""
+        row, column, inside = self._cells(points)
+        self.furniture[row[inside], column[inside]] = True
+
+    def _cells(self, points: F64) -> tuple[I64, I64, Bool]:
+        """Return row and column of the cells at points (n, 2), and if they are on the grid."""
+        column, row = np.floor((points - self.origin) / CELL_M).astype(int).T
+        h, w = self.levels.shape
+        return row, column, (row >= 0) & (row < h) & (column >= 0) & (column < w)
 
 
 def free_space(evidence: Evidence, storey: Storey, margin_m: float = 0.5) -> FreeSpace:
@@ -49,4 +68,4 @@ def free_space(evidence: Evidence, storey: Storey, margin_m: float = 0.5) -> Fre
     level = (evidence.normals[:, 2] > np.cos(np.radians(LEVEL_DEG))) & (np.abs(evidence.points[:, 2] - storey.bottom_m) < 0.1)
     column, row = np.floor((evidence.points[level, :2] - low) / CELL_M).astype(int).T
     floor[row, column] = True
-    return FreeSpace(low, twice, floor)
+    return FreeSpace(low, twice, floor, np.zeros((h, w), np.bool_))

@@ -13,13 +13,16 @@ import numpy as np
 from trihedron.pipeline.core.options import PositiveFloat, Range
 from trihedron.pipeline.core.types import F64, Bool, Building, Map
 from trihedron.plugins.building.assembly import StoreyPlan, assemble_building, empty_building
-from trihedron.plugins.building.cell_complex import Cells, cells_of, free_cells
+from trihedron.plugins.building.cell_complex import Cells, cells_of, inside_cells
+from trihedron.plugins.building.doubts import doubts_of
 from trihedron.plugins.building.evidence import Evidence
 from trihedron.plugins.building.faces import faces_of, slanted_directions
 from trihedron.plugins.building.free_space import free_space
+from trihedron.plugins.building.jogs import SHORT_M, jog_sides
 from trihedron.plugins.building.levels import Storey, in_storey, storeys_of
 from trihedron.plugins.building.openings import openings_of
 from trihedron.plugins.building.rooms import rooms_of
+from trihedron.plugins.building.tall_furniture import remove_furniture
 from trihedron.plugins.building.views import BuildingState, LayoutOptions, gather_evidence
 from trihedron.plugins.building.walls import walls_of
 
@@ -31,7 +34,7 @@ def plan_building(
     state: BuildingState,
     map: Map | None,
     directions: Callable[[Evidence, Storey], F64],
-    inside: Callable[[Cells], Bool] = free_cells,
+    inside: Callable[[Cells], Bool] = inside_cells,
     remark: Callable[[Evidence, Storey], str] = lambda evidence, storey: "",
 ) -> Building:
     """Make the plan of each storey at the final poses: faces, free space, cells, and of those that are inside, rooms, walls and openings.
@@ -44,9 +47,13 @@ def plan_building(
     for number, storey in enumerate(storeys):
         here = in_storey(evidence, storeys, number)
         space = free_space(here, storey)
-        faces = faces_of(here, storey, space, directions(here, storey), options.least_wall_m)
+        found = faces_of(here, storey, space, directions(here, storey), min(SHORT_M, options.least_wall_m))
+        faces, doubts = remove_furniture(found, here, storey, space, options.least_wall_m)
+        faces += jog_sides(faces, here)
         cells = cells_of(faces, space)
         rooms = rooms_of(cells, inside(cells), faces, here, space, storey, options.least_room_m2)
+        for room in rooms:
+            room.doubts = doubts_of(room, doubts, space)
         walls = walls_of(rooms, faces, here, storey, options.least_wall_m)
         openings = openings_of(walls, rooms, faces, here, space, storey)
         plans.append(StoreyPlan(storey, rooms, walls, openings, faces, remark(here, storey)))

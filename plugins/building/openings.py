@@ -14,6 +14,7 @@ from trihedron.plugins.building.evidence import Evidence
 from trihedron.plugins.building.faces import Face
 from trihedron.plugins.building.free_space import CELL_M, LEVEL_M, FreeSpace
 from trihedron.plugins.building.free_space_kernels import LEVELS, U32
+from trihedron.plugins.building.jogs import is_recess
 from trihedron.plugins.building.levels import Storey, sliding_sum
 from trihedron.plugins.building.rooms import RoomPlan, room_at
 from trihedron.plugins.building.walls import AROUND_M, WallPlan
@@ -95,7 +96,7 @@ def _opening(
     if gap is None:
         return None
     a, b, sigma_side, jambs = fit_jambs(*gap, _between_levels(open_levels, *near))
-    if b - a < NARROWEST_M:
+    if b - a < NARROWEST_M or (wall.edge.face is not None and is_recess(wall.edge.face, a, b, faces)):
         return None
     bottom, top, sigma_top, lintel = _heights(a, b, open_levels, *near)
     ceiling = storey.ceiling_m - storey.bottom_m if np.isfinite(storey.ceiling_m) else float("inf")

@@ -4,7 +4,7 @@ Mura, Mattausch, Jaspe Villanueva, Gobbetti, Pajarola, Computers & Graphics 2014
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -26,6 +26,7 @@ class RoomPlan:
 
     loops: list[list[Edge]]
     polygon: Any
+    doubts: list[tuple[float, float]] = field(default_factory=list)  # `doubts_of`
 
 
 def rooms_of(cells: Cells, inside: Bool, faces: list[Face], evidence: Evidence, space: FreeSpace, storey: Storey, least_m2: float) -> list[RoomPlan]:

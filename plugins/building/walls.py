@@ -10,7 +10,7 @@ from trihedron.pipeline.core.linalg import matmul
 from trihedron.plugins.building.cell_complex import TALL_SHARE
 from trihedron.plugins.building.edges import THICKEST_M, THINNEST_M, Edge, fit_edge
 from trihedron.plugins.building.evidence import Evidence
-from trihedron.plugins.building.faces import Face
+from trihedron.plugins.building.faces import Face, runs_of
 from trihedron.plugins.building.free_space import CELL_M
 from trihedron.plugins.building.levels import Storey
 from trihedron.plugins.building.rooms import RoomPlan, room_at
@@ -69,8 +69,8 @@ def _is_within_room(edge: Edge, rooms: list[RoomPlan]) -> bool:
 
 def _stretches(face: Face, least_m: float) -> list[tuple[float, float]]:
     """Return begin and end along a face of its tall stretches of at least a length."""
-    ends = np.nonzero(np.diff(np.concatenate([[False], face.tall, [False]])))[0]
-    return [(float(a), float(b)) for a, b in face.start_m + CELL_M * ends.reshape(-1, 2) if b - a >= least_m - 1e-9]
+    runs = [(face.start_m + CELL_M * a, face.start_m + CELL_M * b) for a, b in runs_of(face.tall)]
+    return [(a, b) for a, b in runs if b - a >= least_m - 1e-9]
 
 
 def _is_beside(edge: Edge, wall: WallPlan) -> bool:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from trihedron.comparison.floorplan_scores import Score, floorplan_scores
 from trihedron.pipeline.core.errors import DataError
 
 if TYPE_CHECKING:
@@ -56,6 +57,7 @@ def plan_errors(building: Building, T_truth_world: F64, plans: list[TruePlan]) -
     walls = [error for a, b in pairs for error in _edges(building, a, truth[b][1], T)]
     heights = _heights(building, at, plans)
     found = [_doors(building, plan, T, building.wall_storeys[building.opening_walls] == storey) for storey, plan in _storey_plan_pairs(at, plans)]
+    scores = _scores(building, mine, at, truth)
     doors, false, doorways = sum(hits for hits, _ in found), sum(wrong for _, wrong in found), sum(len(plan.doorways) for plan in plans)
     honest = [abs(error) < 1.96 * np.sqrt(building.area_variance[a]) for error, (a, _) in zip(areas, pairs)]
     honest += [abs(off) < 1.96 * sigma for off, _, sigma in walls if np.isfinite(sigma)]
@@ -64,6 +66,9 @@ def plan_errors(building: Building, T_truth_world: F64, plans: list[TruePlan]) -
         "wall_m": _median([abs(off) for off, *_ in walls]),
         "angle_deg": _median([abs(angle) for _, angle, _ in walls]),
         "iou": _median([overlap[a, b] for a, b in pairs]),
+        **{f"{name}_f1": score.f1 for name, score in scores.items()},
+        "corner_precision": scores["corner"].precision,
+        "corner_recall": scores["corner"].recall,
         "room_recall": len({b for _, b in pairs}) / len(truth),
         "room_precision": len(pairs) / len(mine) if mine else float("nan"),
         "door_recall": doors / doorways if doorways else float("nan"),
@@ -72,6 +77,15 @@ def plan_errors(building: Building, T_truth_world: F64, plans: list[TruePlan]) -
         "height_m": _median([abs(error) for error, _ in heights]),
         "honest": float(np.mean(honest)) if honest else float("nan"),
     }
+
+
+def _scores(building: Building, rooms: list[Any], at: list[int], truth: list[tuple[int, Any, Any]]) -> dict[str, Score]:
+    """Return the scores of rooms, corners and angles over all storeys."""
+    found = []
+    for storey in sorted({storey for storey, *_ in truth}):
+        mine = [room for k, room in enumerate(rooms) if at[building.room_storeys[k]] == storey]
+        found.append(floorplan_scores(mine, [polygon for other, _, polygon in truth if other == storey]))
+    return {name: sum((one[name] for one in found), Score(0, 0, 0)) for name in ("room", "corner", "angle")}
 
 
 def storeys_at(building: Building, T: F64, plans: list[TruePlan]) -> list[int]:

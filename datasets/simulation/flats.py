@@ -1,0 +1,286 @@
+"""Flats by number: rooms, doors and furniture drawn at random, and the walk that shows every room. Metres, z up.
+
+What plans get wrong stands in them: wardrobes of 1.8 m to 2.4 m, shelves, curtains, niches, radiators, columns and half-open doors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from trihedron.datasets.simulation.buildings import DETAIL, DOORWAY_M, Building, lamps_at, rectangle, wall_with_gaps
+from trihedron.datasets.simulation.furniture import PIECES
+from trihedron.datasets.simulation.motion import Sway
+from trihedron.datasets.simulation.room import HEIGHT_M, UP, Room, Solid, Wall, box, shell, turned_box, walls_of
+from trihedron.datasets.simulation.walks import Walk
+from trihedron.pipeline.core.linalg import norm
+from trihedron.pipeline.core.types import F64
+
+JAMB_M = 0.35  # least distance of a door from the end of its wall
+CLEAR_M = 0.3  # of furniture from the path
+AISLE_M = 2.2  # a narrower room is walked along its middle
+STEP_M = 0.6  # before and behind a door, where the path is square to it
+SPEED_M_S, LOOK_AHEAD_M = 0.5, 0.5
+GAZE_DEG = Sway((14.0, 10.0, 2.0), (7.3, 5.7, 4.9))  # yaw, pitch, roll: who scans a flat looks up and down
+LEAST_SHARED_M = DOORWAY_M[0] + 2.0 * JAMB_M  # of a wall between two rooms, for a door
+
+
+@dataclass(frozen=True)
+class _Door:
+    """A doorway between rooms `a` and `b`: its middle (2,), the unit direction (2,) from a to b, the thickness of its wall."""
+
+    a: int
+    b: int
+    middle: F64
+    across: F64
+    depth_m: float
+
+
+@dataclass
+class _Partition:
+    """A wall between rooms, from `start` to `end` along its middle line, and the middles of its doors along it."""
+
+    start: tuple[float, float]
+    end: tuple[float, float]
+    depth_m: float
+    doors: list[float] = field(default_factory=list)
+
+    @property
+    def is_level(self) -> bool:
+        """Say if it runs along x."""
+        return self.start[1] == self.end[1]
+
+
+Rectangle = tuple[float, float, float, float]  # west, east, south, north
+
+
+def random_flat(number: int) -> Building:
+    """Make flat `number`: 7 m to 11 m by 6 m to 9 m, three to six rooms in two blocks or along a corridor."""
+    rng = np.random.default_rng([number, 41])
+    width, depth = _between(rng, 7.5, 10.5), _between(rng, 6.2, 8.6)
+    rooms, partitions = (_corridor_plan if rng.uniform() < 0.35 else _block_plan)(rng, width, depth)
+    doors = _doors(rng, rooms, partitions)
+    path = _path(rooms, doors)
+    solids = [solid for wall in partitions for solid in _partition_solids(wall)]
+    for room in rooms:
+        solids += _niche(rng, room, (width, depth), path) if rng.uniform() < 0.3 else []
+    for number_of_room, room in enumerate(rooms):
+        solids += _furniture(rng, room, [door for door in doors if number_of_room in (door.a, door.b)], path, solids)
+    solids += [solid for door in doors if rng.uniform() < 0.4 for solid in _leaf(rng, door, path)]
+    planes, faces = shell(rectangle((0.0, width), (0.0, depth)))
+    hanging, lights = lamps_at([((west + east) / 2.0, (south + north) / 2.0) for west, east, south, north in rooms])
+    return Building(Room(planes, faces, (*solids, *hanging), lights, DETAIL), Walk(path, SPEED_M_S, LOOK_AHEAD_M, gaze_deg=GAZE_DEG))
+
+
+def _between(rng: np.random.Generator, low: float, high: float) -> float:
+    """Draw a length in whole centimetres."""
+    return round(float(rng.uniform(low, high)), 2)
+
+
+def _thickness(rng: np.random.Generator) -> float:
+    return float(rng.choice([0.08, 0.1, 0.12, 0.16]))
+
+
+def _block_plan(rng: np.random.Generator, width: float, depth: float) -> tuple[list[Rectangle], list[_Partition]]:
+    """Cut the flat into a west and an east block, and each, or one, into two rooms."""
+    middle, rooms = _between(rng, 0.42 * width, 0.58 * width), list[Rectangle]()
+    walls = [_Partition((middle, 0.0), (middle, depth), _thickness(rng))]
+    half = walls[0].depth_m / 2.0
+    whole = int(rng.integers(3))  # this block stays one room; 2 = none does
+    for block, (west, east) in enumerate(((0.0, middle - half), (middle + half, width))):
+        if block == whole:
+            rooms.append((west, east, 0.0, depth))
+            continue
+        cut = _Partition((west, level := _between(rng, 0.4 * depth, 0.6 * depth)), (east, level), _thickness(rng))
+        walls.append(cut)
+        rooms += [(west, east, 0.0, level - cut.depth_m / 2.0), (west, east, level + cut.depth_m / 2.0, depth)]
+    return rooms, walls
+
+
+def _corridor_plan(rng: np.random.Generator, width: float, depth: float) -> tuple[list[Rectangle], list[_Partition]]:
+    """Lay a corridor from west to east, with two rooms on its north side and one or two on its south side."""
+    low = _between(rng, 0.38 * depth, 0.44 * depth)
+    high = low + _between(rng, 1.4, 1.7)
+    south, north = _Partition((0.0, low), (width, low), _thickness(rng)), _Partition((0.0, high), (width, high), _thickness(rng))
+    rooms, walls = [(0.0, width, low + south.depth_m / 2.0, high - north.depth_m / 2.0)], [south, north]
+    for bottom, top, parted in ((high + north.depth_m / 2.0, depth, True), (0.0, low - south.depth_m / 2.0, rng.uniform() < 0.6)):
+        if not parted:
+            rooms.append((0.0, width, bottom, top))
+            continue
+        cut = _Partition((at := _between(rng, 0.4 * width, 0.6 * width), bottom), (at, top), _thickness(rng))
+        walls.append(cut)
+        rooms += [(0.0, at - cut.depth_m / 2.0, bottom, top), (at + cut.depth_m / 2.0, width, bottom, top)]
+    return rooms, walls
+
+
+def _doors(rng: np.random.Generator, rooms: list[Rectangle], partitions: list[_Partition]) -> list[_Door]:
+    """Join the rooms by doors: as many as reach all of them, and one more in some flats. They are added to their walls."""
+    possible = []
+    for a in range(len(rooms)):
+        for b in range(len(rooms)):
+            for wall in partitions:
+                axis = 1 if wall.is_level else 0
+                line, near = wall.start[axis], wall.depth_m / 2.0 + 1e-6
+                if abs(rooms[a][2 * axis + 1] - line) > near or abs(rooms[b][2 * axis] - line) > near:
+                    continue
+                other = 2 * (1 - axis)
+                low, high = max(rooms[a][other], rooms[b][other]), min(rooms[a][other + 1], rooms[b][other + 1])
+                if high - low >= LEAST_SHARED_M:
+                    possible.append((a, b, wall, axis, low, high))
+    found, joined, spare = list[_Door](), {0}, rng.uniform() < 0.3
+    order = [possible[k] for k in rng.permutation(len(possible))]
+    while True:
+        reaching = [item for item in order if (item[0] in joined) != (item[1] in joined)]
+        more = [item for item in order if not any({item[0], item[1]} == {door.a, door.b} for door in found)]
+        chosen = reaching[0] if reaching else more[0] if spare and more else None
+        if chosen is None:
+            return found
+        spare = spare and bool(reaching)
+        a, b, wall, axis, low, high = chosen
+        at = _between(rng, low + LEAST_SHARED_M / 2.0, high - LEAST_SHARED_M / 2.0)
+        across = np.eye(2)[axis]
+        middle = across * wall.start[axis] + np.eye(2)[1 - axis] * at
+        wall.doors.append(at - wall.start[1 - axis])
+        found.append(_Door(a, b, middle, across, wall.depth_m))
+        joined |= {a, b}
+
+
+def _partition_solids(wall: _Partition) -> list[Solid]:
+    return wall_with_gaps(wall.start, wall.end, [(at, DOORWAY_M[0], 0.0, DOORWAY_M[1]) for at in wall.doors], wall.depth_m)
+
+
+def _path(rooms: list[Rectangle], doors: list[_Door]) -> tuple[tuple[float, float], ...]:
+    """Walk through all rooms by their doors and back, round each room once."""
+    points, seen = list[F64](), set[int]()
+
+    def visit(room: int) -> None:
+        seen.add(room)
+        tour = _tour(rooms[room], points[-1] if points else np.zeros(2))
+        points.extend(tour)
+        for door in doors:
+            if room in (door.a, door.b) and (other := door.a + door.b - room) not in seen:
+                ahead = door.across * (1.0 if room == door.a else -1.0) * (STEP_M + door.depth_m / 2.0)
+                points.extend([door.middle - ahead, door.middle + ahead])
+                visit(other)
+                points.extend([door.middle + ahead, door.middle - ahead])
+        points.append(tour[0] * 0.98 + 0.02 * tour[1])
+
+    visit(0)
+    apart = [p for p, q in pairwise([*points, points[0]]) if norm(q - p) > 0.05]
+    return tuple((float(x), float(y)) for x, y in apart)
+
+
+def _tour(room: Rectangle, entry: F64) -> list[F64]:
+    """Return way-points (2,) round a room, the nearest to where it is entered first; a narrow room is walked along its middle."""
+    west, east, south, north = room
+    if north - south < AISLE_M or east - west < AISLE_M:
+        x, y = (west + east) / 2.0, (south + north) / 2.0
+        ends = [np.array([west + 0.9, y]), np.array([east - 0.9, y])] if east - west > north - south else [np.array([x, south + 0.9]), np.array([x, north - 0.9])]
+        return sorted(ends, key=lambda p: float(norm(p - entry)))
+    x_in, y_in = min(1.25, 0.36 * (east - west)), min(1.25, 0.36 * (north - south))
+    ring = [np.array(p) for p in rectangle((west + x_in, east - x_in), (south + y_in, north - y_in))]
+    first = int(np.argmin([norm(p - entry) for p in ring]))
+    return [*ring[first:], *ring[:first]]
+
+
+def _free(solid: Solid, path: Any, taken: list[Any]) -> bool:
+    """Say if a solid stands off the path and overlaps no other on the plan; then it is added to `taken`."""
+    import shapely
+
+    corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * solid.half[:2]
+    outline = shapely.Polygon(corners @ solid.R_world_solid[:2, :2].T + solid.centre[:2])
+    if outline.distance(path) < CLEAR_M or any(outline.distance(other) < 0.05 for other in taken):
+        return False
+    taken.append(outline)
+    return True
+
+
+def _niche(rng: np.random.Generator, room: Rectangle, size: tuple[float, float], path: tuple[tuple[float, float], ...]) -> list[Solid]:
+    """Fill the outer wall of a room by 0.3 m but for a niche, where that leaves the path free."""
+    import shapely
+
+    (west, east, south, north), (width, depth) = room, size
+    sides = [side for side, at_shell in enumerate((south == 0.0, east == width, north == depth, west == 0.0)) if at_shell]
+    wall = walls_of(rectangle((west, east), (south, north)))[int(rng.choice(sides))]
+    wide, deep = _between(rng, 1.0, 1.6), 0.3
+    at = _between(rng, 0.6 + wide / 2.0, max(wall.length_m - 0.6 - wide / 2.0, 0.61 + wide / 2.0))
+    parts = [(0.0, at - wide / 2.0), (at + wide / 2.0, wall.length_m)]
+    solids = [wall.mount_box((a + b) / 2.0, (0.0, HEIGHT_M), b - a, deep, "wall") for a, b in parts if b - a > 0.3]
+    line = shapely.LineString([*path, path[0]])
+    return solids if len(solids) == 2 and all(_free(solid, line, []) for solid in solids) else []
+
+
+WEIGHTS = {"wardrobe": 3, "tall_shelf": 1, "shelf": 2, "curtain": 1, "radiator": 1, "cabinet": 2, "desk": 1, "sofa": 1, "locker": 1, "column": 1}
+ON_WALLS = ("picture", "portrait", "picture", "portrait", "window")
+
+
+def _furniture(rng: np.random.Generator, room: Rectangle, doors: list[_Door], path: tuple[tuple[float, float], ...], walls: list[Solid]) -> list[Solid]:
+    """Furnish a room along its walls, clear of doors and path; what is free of the walls has pictures."""
+    import shapely
+
+    line, doorways = shapely.LineString([*path, path[0]]), [shapely.Point(door.middle).buffer(0.75) for door in doors]
+    west, east, south, north = room
+    inner = [solid for solid in walls if _is_within(solid, room)]
+    taken = [*doorways, *(shapely.Point(solid.centre[:2]).buffer(float(norm(solid.half[:2]))).envelope for solid in inner)]
+    found: list[Solid] = []
+    for wall in walls_of(rectangle((west, east), (south, north))):
+        for _ in range(2 if wall.length_m > 2.5 else 1):
+            name = str(rng.choice(list(WEIGHTS), p=np.array(list(WEIGHTS.values())) / sum(WEIGHTS.values())))
+            at = _between(rng, 0.2, wall.length_m - 0.2)
+            pieces = _piece(rng, name, wall, at)
+            fits = all(_is_within(solid, room) for solid in pieces)
+            if fits and _free(max(pieces, key=lambda solid: float(solid.half[0] * solid.half[1])), line, taken):
+                found += pieces
+        spots = np.arange(0.6, wall.length_m - 0.5, 1.1)
+        for at in spots:
+            pieces = PIECES[str(rng.choice(ON_WALLS))](wall, float(at) + _between(rng, -0.15, 0.15))
+            outline = shapely.box(*_bounds(pieces))
+            if all(_is_within(solid, room) for solid in pieces) and not any(outline.intersects(other) for other in taken):
+                found += pieces
+                taken.append(outline)
+    return found
+
+
+def _bounds(solids: list[Solid]) -> tuple[float, float, float, float]:
+    """Return west, south, east and north of solids that are square to the axes."""
+    half = np.array([np.abs(solid.R_world_solid[:2, :2]) @ solid.half[:2] for solid in solids])
+    centre = np.array([solid.centre[:2] for solid in solids])
+    low, high = (centre - half).min(axis=0), (centre + half).max(axis=0)
+    return float(low[0]), float(low[1]), float(high[0]), float(high[1])
+
+
+def _is_within(solid: Solid, room: Rectangle) -> bool:
+    west, south, east, north = _bounds([solid])
+    return room[0] - 1e-6 <= west and east <= room[1] + 1e-6 and room[2] - 1e-6 <= south and north <= room[3] + 1e-6
+
+
+def _piece(rng: np.random.Generator, name: str, wall: Wall, at: float) -> list[Solid]:
+    """Return a piece of furniture of random size at a place along a wall."""
+    if name == "wardrobe":
+        return [wall.mount_box(at, (0.0, _between(rng, 1.8, 2.4)), _between(rng, 0.9, 2.2), _between(rng, 0.5, 0.65), "wood", "drawers")]
+    if name == "tall_shelf":
+        return [wall.mount_box(at, (0.0, _between(rng, 1.9, 2.3)), _between(rng, 0.8, 1.6), 0.3, "paper", "books")]
+    if name == "curtain":
+        return [wall.mount_box(at, (0.02, 2.45), _between(rng, 0.9, 1.8), 0.06, "fabric", off_m=0.08)]
+    if name == "radiator":
+        return [wall.mount_box(at, (0.12, 0.72), _between(rng, 0.8, 1.4), 0.1, "plastic", off_m=0.04)]
+    if name == "column":
+        return [wall.mount_box(at, (0.0, HEIGHT_M), 0.35, 0.35, "wall")]
+    return PIECES[name](wall, at)
+
+
+def _leaf(rng: np.random.Generator, door: _Door, path: tuple[tuple[float, float], ...]) -> list[Solid]:
+    """Hang a door that stands open by 60° to 110° in a doorway, on a side where nobody runs into it."""
+    import shapely
+
+    line = shapely.LineString([*path, path[0]])
+    along, opened, wide = np.array([-door.across[1], door.across[0]]), float(np.radians(rng.uniform(60.0, 110.0))), DOORWAY_M[0] - 0.06
+    for side, into in ((1.0, 1.0), (-1.0, 1.0), (1.0, -1.0), (-1.0, -1.0)):
+        hinge = door.middle + side * along * (DOORWAY_M[0] / 2.0 - 0.02) + into * door.across * (door.depth_m / 2.0 + 0.02)
+        leaf = -side * np.cos(opened) * along + into * np.sin(opened) * door.across
+        if shapely.LineString([hinge, hinge + wide * leaf]).distance(line) > 0.2:
+            centre = np.array([*(hinge + wide / 2.0 * leaf), 0.0]) + 1.03 * UP
+            return [turned_box(centre, np.array([wide / 2.0, 0.02, 1.02]), float(np.arctan2(leaf[1], leaf[0])), "wood", "door", 3)]
+    return []

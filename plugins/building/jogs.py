@@ -1,0 +1,105 @@
+"""Jogs of walls: the short sides of niches, of columns and of steps in a wall, which views hardly show."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+
+from trihedron.pipeline.core.linalg import matmul
+from trihedron.pipeline.core.types import F64, Bool
+from trihedron.plugins.building.evidence import Evidence
+from trihedron.plugins.building.faces import Face, runs_of
+from trihedron.plugins.building.free_space import CELL_M
+from trihedron.plugins.building.free_space_kernels import LEVELS
+from trihedron.plugins.shared.voxel_hash_kernels import I64
+
+DEPTH_M = (0.1, 1.0)  # of a jog
+BESIDE_M = 0.4  # from the end of the face in front, where the face behind is read
+SHORT_M = 0.2  # least wall that meets the ceiling: the side of a niche, a column
+MOSTLY_BEHIND = 0.3  # of the levels at which the face behind is read, fewer than which the front is read beyond its end
+END_M = 0.25  # of a face, whose readings say where it ends
+WIDEST_DOOR_M = 1.6
+THICKEST_M = 0.3  # wall between two faces
+SAME_SIDE_M = 0.12  # from a face that was found
+
+
+def jog_sides(faces: list[Face], evidence: Evidence) -> list[Face]:
+    """Return a face for each end of a tall stretch beyond which another face is read behind its line: square to both, from one to the other."""
+    found: list[Face] = []
+    for front in faces:
+        for a, b in runs_of(front.tall):
+            if (b - a) * CELL_M < SHORT_M:
+                continue
+            for at_end in (False, True):
+                behind = [other for other in faces if _is_read_beyond(front, other, b if at_end else a, at_end)]
+                if behind:
+                    side = _side(front, max(behind, key=lambda other: other.offset_m), a, b, at_end, evidence)
+                    if not any(_is_same(side, other) for other in (*faces, *found)):
+                        found.append(side)
+    return found
+
+
+def parting_columns(face: Face, faces: list[Face]) -> Bool:
+    """Return the columns (k,) of a face that part rooms: the tall ones, and gaps between them as wide as a door unless a face close behind shows that they
+    are niches."""
+    out = face.tall.copy()
+    for (_, a), (b, _) in pairwise(runs_of(face.tall)):
+        niche = any(_is_read_beyond(face, other, a, True) or _is_read_beyond(face, other, b, False) for other in faces)
+        if (b - a) * CELL_M <= WIDEST_DOOR_M and not niche:
+            out[a:b] = True
+    return out
+
+
+def _is_read_beyond(front: Face, other: Face, column: int, at_end: bool) -> bool:
+    """Say if beyond an end of a stretch the front is not read, and the other face is, as far behind it as a jog is deep."""
+    if float(matmul(front.normal, other.normal)) < 0.999 or not DEPTH_M[0] < front.offset_m - other.offset_m < DEPTH_M[1]:
+        return False
+    end, width = front.start_m + CELL_M * column, round(BESIDE_M / CELL_M)
+    beyond = end + CELL_M * (np.arange(width) + 1.5) * (1.0 if at_end else -1.0)
+    ahead, behind = levels_read(front, beyond), levels_read(other, beyond)
+    return bool(ahead.sum() < MOSTLY_BEHIND * behind.sum() and (behind > 0).mean() > 0.5)
+
+
+def is_recess(wall: Face, begin_m: float, end_m: float, faces: list[Face]) -> bool:
+    """Say if a face is read close behind most of a stretch of a wall: what is open there is a niche."""
+    places = np.arange(begin_m + CELL_M / 2.0, end_m, CELL_M)
+    for face in faces:
+        if float(matmul(face.normal, wall.normal)) > 0.999 and DEPTH_M[0] < wall.offset_m - face.offset_m < DEPTH_M[1]:
+            if (levels_read(face, places) > 0).mean() > 0.5:
+                return True
+    return False
+
+
+def levels_read(face: Face, along: F64) -> I64:
+    """Return at how many levels a face was read at places (n,) along it."""
+    column = np.floor((along - face.start_m) / CELL_M).astype(int)
+    inside = (column >= 0) & (column < len(face.count))
+    out = np.zeros(len(along), np.int64)
+    out[inside] = (face.count[column[inside]] > 0).sum(axis=1)
+    return out
+
+
+def _side(front: Face, behind: Face, a: int, b: int, at_end: bool, evidence: Evidence) -> Face:
+    """Return the side from the end of the readings of a stretch to the face behind it."""
+    begin, end = front.start_m + CELL_M * a, front.start_m + CELL_M * b
+    along = matmul(evidence.points[front.members, :2], front.along)
+    last = along[(along > end - END_M) & (along < end + CELL_M)] if at_end else along[(along > begin - CELL_M) & (along < begin + END_M)]
+    at = float(np.percentile(last, 99.0 if at_end else 1.0)) if len(last) else end if at_end else begin
+    sign = 1.0 if at_end else -1.0
+    normal = sign * front.along
+    corners = np.array([at * front.along + offset * front.normal for offset in (front.offset_m, behind.offset_m)])
+    along_side = np.array([normal[1], -normal[0]])
+    start, stop = np.sort(matmul(corners, along_side))
+    count = np.zeros((max(round(float(stop - start) / CELL_M), 1), LEVELS), np.int32)
+    count[:, 0] = 1
+    every = np.ones(len(count), np.bool_)
+    return Face(normal, sign * at, float(start), count, every, np.empty(0, np.int64), every)
+
+
+def _is_same(side: Face, other: Face) -> bool:
+    """Say if a face that was found is about where the side is."""
+    if float(matmul(side.normal, other.normal)) < 0.999 or abs(side.offset_m - other.offset_m) > SAME_SIDE_M:
+        return False
+    begin, end = side.start_m, side.start_m + CELL_M * len(side.count)
+    return other.share(begin, end, other.count.any(axis=1)) > 0.5
