@@ -40,8 +40,8 @@ SCHEMA_VERSION = 1
 @register_files("building")
 def write_building(out: Path, building: Building) -> list[str]:
     """Write the files of a run folder and return a line that describes them."""
-    write_file(out / JSON, json.dumps(building_json(building), indent=1) + "\n")
-    write_file(out / SVG, floorplan_svg(building))
+    write_json(out / JSON, building)
+    write_svg(out / SVG, building)
     write_dxf(out / DXF, building)
     write_glb(out / GLB, building)
     return [summary(building)]
@@ -53,6 +53,11 @@ def summary(building: Building) -> str:
 
 
 # JSON.
+
+
+def write_json(path: Path, building: Building) -> None:
+    """Write all elements as JSON."""
+    write_file(path, json.dumps(building_json(building), indent=1) + "\n")
 
 
 def building_json(building: Building) -> dict[str, Any]:
@@ -134,6 +139,11 @@ text{font-family:Helvetica,Arial,sans-serif;fill:#222;text-anchor:middle}
 .swing{fill:none;stroke:#777;stroke-width:1}.leaf{stroke:#555;stroke-width:2}.glass{fill:#fff;stroke:#38c;stroke-width:1.5}
 .name{font-size:15px;font-weight:bold}.area{font-size:13px}.small{font-size:9px}.length{font-size:10px;fill:#666}.note{font-size:12px;text-anchor:start}
 """
+
+
+def write_svg(path: Path, building: Building) -> None:
+    """Write the plan as SVG."""
+    write_file(path, floorplan_svg(building))
 
 
 def floorplan_svg(building: Building) -> str:
