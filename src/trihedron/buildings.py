@@ -17,6 +17,7 @@ from trihedron.pipeline.core.errors import DataError, UsageError
 from trihedron.pipeline.core.linalg import matmul, norm
 from trihedron.pipeline.core.types import F64, OPENING_KINDS, Pose
 from trihedron.plugins.building.geometry import quad, rings_of
+from trihedron.plugins.building.labels import name_of, use_of
 
 if TYPE_CHECKING:
     import shapely
@@ -64,6 +65,7 @@ class Wall(Described):
     offset_sigma_m: float
     unseen: F64
     corners: F64
+    name: str = ""
 
     @cached_property
     def outline(self) -> shapely.Polygon:
@@ -105,6 +107,8 @@ class Room(Described):
     perimeter_m: Measurement
     openings: tuple[int, ...]
     closed: bool
+    name: str = ""
+    use: str = ""
 
     @cached_property
     def polygon(self) -> shapely.Polygon:
@@ -125,6 +129,7 @@ class Opening(Described):
     height_m: Measurement
     rooms: tuple[int | None, int | None]
     corners: F64
+    name: str = ""
 
     @cached_property
     def outline(self) -> shapely.Polygon:
@@ -360,6 +365,7 @@ class Building:
         return Wall(
             k, int(self.plan.wall_storeys[k]), start, end, Measurement(float(norm(end - start)), sigma),
             Measurement(float(self.plan.thickness_m[k]), thickness), offset, rows[:, 1:], quad(self.plan, k, 0.0, float(norm(end - start))),
+            name_of(self.plan, "wall", k),
         )  # fmt: skip
 
     def _end_sigma(self, wall: int, end: F64) -> float:
@@ -386,7 +392,7 @@ class Building:
         openings = tuple(int(o) for o in np.nonzero((self.plan.opening_rooms == k).any(axis=1))[0])
         return Room(
             k, int(self.plan.room_storeys[k]), outer, tuple(holes), tuple(edges), area, self._perimeter(first, stop), openings,
-            bool(self.plan.closed[k]),
+            bool(self.plan.closed[k]), name_of(self.plan, "room", k), use_of(self.plan, k),
         )  # fmt: skip
 
     def _edges(self, a: int, b: int) -> list[Edge]:
@@ -423,7 +429,9 @@ class Building:
         width = Measurement(float(right - left), float(np.hypot(sigma[0], sigma[1])))
         height = Measurement(float(top - bottom), float(np.hypot(sigma[2], sigma[3])))
         corners = quad(self.plan, wall.number, float(left), float(right))
-        return Opening(k, OPENING_KINDS[self.plan.opening_kinds[k]], wall.number, middle, width, height, (a, b), corners)
+        return Opening(
+            k, OPENING_KINDS[self.plan.opening_kinds[k]], wall.number, middle, width, height, (a, b), corners, name_of(self.plan, "opening", k)
+        )
 
 
 @contextmanager
