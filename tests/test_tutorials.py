@@ -17,6 +17,7 @@ BLOCK = re.compile(r'^```(\w*)(?: title="([^"]+)")?\n(.*?)^```$', re.MULTILINE |
 REPORTED = {  # lines that a tutorial's commands must print
     "first-run": ("frames: 60 ok", "Keypoints", "manhattan"),
     "own-recording": ("frames: 40 ok",),
+    "floor-plan": ("3 rooms", "Kitchen cooking", "written: flat.svg flat.ifc", "space: Kitchen cooking"),
     "swap-and-compare": ("* mean_shift", "branch_and_bound", "did you mean 'normals'"),
     "which-estimator": ("as recorded against manhattan=plane_svd: axes", "false axes %", "differs.png", "mean of 3 recordings"),
     "write-a-plugin": ("all is well", "ok"),

@@ -4,16 +4,22 @@ RUN is a run folder or its recording. A building that is recorded (outputs=[traj
 made from the frames, planes and poses of the recording. Metres; z up from the lowest floor, y (north on the plan) the direction of the building
 nearest to the first camera's view. model.ifc needs ifcopenshell: pip install 'trihedron[ifc]'.
 
+Corrections are made in building.json: "deleted": true, another kind, a name, a use, an opening without an id. --edits building.json keeps them.
+
 Example: trihedron building runs/latest
 """
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from trihedron.pipeline.core.errors import DataError, UsageError, did_you_mean
 from trihedron.recorded_building import building_of
 from trihedron.tools.arguments import Parser
+
+if TYPE_CHECKING:
+    from trihedron.pipeline.core.types import Building
 
 RECORDING = "run.mcap"
 
@@ -23,6 +29,7 @@ def main(argv: list[str]) -> int:
     parser = Parser("building", __name__)
     parser.add_argument("run", metavar="RUN", type=Path)
     parser.add_argument("--plugin", metavar="NAME", help="make it anew by this plugin, for example atlanta_layout (default: as recorded)")
+    parser.add_argument("--edits", metavar="FILE", help="a building.json that was corrected by hand; what was changed there is kept")
     parser.add_argument("--out", metavar="FOLDER", type=Path, help="where to write (default: beside the recording)")
     options = parser.parse_args(argv)
     from trihedron.pipeline.core.libraries import library_error
@@ -35,8 +42,10 @@ def main(argv: list[str]) -> int:
     if options.plugin is not None and options.plugin not in plugins_of("building"):
         raise UsageError("building", f"there is no building '{options.plugin}'", did_you_mean(options.plugin, list(plugins_of("building"))))
     path: Path = options.run / RECORDING if options.run.is_dir() else options.run
-    building = building_of(Recording(path), options.plugin)
     out: Path = options.out or path.parent
+    building = building_of(Recording(path), options.plugin, options.edits or "")
+    if options.edits is None and _has_more_edits(out / JSON, building):
+        raise UsageError(str(out / JSON), "holds corrections by hand, which would be lost", f"give --edits {out / JSON}, or another --out FOLDER")
     try:
         out.mkdir(parents=True, exist_ok=True)
         for line in write_building(out, building):
@@ -50,3 +59,19 @@ def main(argv: list[str]) -> int:
     if not has_ifc():
         print(f"no {IFC}: {library_error('ifcopenshell')}")
     return 0
+
+
+def _has_more_edits(path: Path, building: Building) -> bool:
+    """Say if a file has corrections by hand that the building lacks. Raises DataError for a file with a mistake."""
+    from trihedron.plugins.building.edits import WITHOUT_IDS, edits_in, read_edits
+    from trihedron.plugins.building.files import building_json
+
+    if not path.exists():
+        return False
+    try:
+        edits = read_edits(str(path))
+    except DataError as error:
+        if error.cause == WITHOUT_IDS:  # an older version wrote it
+            return False
+        raise
+    return bool(set(edits) - set(edits_in(str(path), building_json(building))))

@@ -65,10 +65,14 @@ def main(argv: list[str]) -> int:
     used = calibration_in_use(recording, recorded.camera)
     found = estimate(recorded)
     print(report(found, recorded.camera))
-    changed = with_estimates(used, found)
-    if changed == used:
+    changed, delay_ms = with_estimates(used, found), 1e3 * float(found.edges[5])
+    if delay_ms:
+        print(
+            f"recommended: add {delay_ms:.1f} to dataset.depth_delay_ms (dataset=tum, tamu and mcap), or pair colour with the depth of its own time"
+        )
+    if changed == used and not delay_ms:
         print("no change recommended")
-    else:
+    if changed != used:
         print("recommended, for camera.yaml:\n" + yaml.safe_dump(_changed_keys(used, changed), sort_keys=False, default_flow_style=None).rstrip())
     if arguments.out is not None:
         if not used.depth_scale:

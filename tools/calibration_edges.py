@@ -15,18 +15,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from trihedron.pipeline.core.types import F32, F64, Bool, Camera, Frame
-from trihedron.pipeline.run.registration_check import depth_edges
+from trihedron.pipeline.run.registration_check import color_gradient, depth_edges
 
 I64 = NDArray[np.int64]
 MIN_EDGES, MAX_EDGES = 60, 200  # of a frame that takes part; more are thinned
 BLURS_PX = (4.0, 1.5)  # of the image, at 640 a line: for the search, then for the estimate
-STRONGEST = 97.0  # percentile of the gradients, above which all count alike
 NAMES = ("log_scale", "shift_x_px", "shift_y_px", "offset_x_m", "offset_y_m", "delay_s")
 PRIOR = np.array([0.1, 8.0, 8.0, 0.05, 0.05, 0.03])  # standard deviations, px at 640 a line
 PRIOR_WEIGHT = 0.002  # of the prior's squares, in units of the score
@@ -68,7 +66,7 @@ def edges_of(frames: Sequence[Frame], motions: F64, blocks: I64) -> Edges:
     pixels, depths, rows, images = [np.zeros((0, 2))], [np.zeros(0)], [np.zeros(0, np.int64)], []
     for row, frame in enumerate(frames):
         found = depth_edges(frame.depth_m)
-        images.append([_gradient(frame, blur * camera.width / 640.0) for blur in BLURS_PX])
+        images.append([color_gradient(frame, max(blur * camera.width / 640.0, 0.8)) for blur in BLURS_PX])
         if len(found) >= MIN_EDGES:
             found = found[np.unique(np.linspace(0, len(found) - 1, MAX_EDGES).astype(int))]
             pixels.append(found.astype(np.float64))
@@ -77,14 +75,6 @@ def edges_of(frames: Sequence[Frame], motions: F64, blocks: I64) -> Edges:
     of = np.concatenate(rows)
     gradients = tuple(np.array([image[k] for image in images]) for k in range(len(BLURS_PX)))
     return Edges(camera, np.concatenate(pixels), np.concatenate(depths), of, blocks[of], motions[of], gradients)
-
-
-def _gradient(frame: Frame, blur_px: float) -> F32:
-    """(h, w) magnitude of the gradient, in units of its mean."""
-    gray = cv2.GaussianBlur(cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY).astype(np.float32), (0, 0), max(blur_px, 0.8))
-    gradient = cv2.magnitude(cv2.Sobel(gray, cv2.CV_32F, 1, 0), cv2.Sobel(gray, cv2.CV_32F, 0, 1))
-    gradient = np.minimum(gradient, np.percentile(gradient[::4, ::4], STRONGEST))
-    return np.asarray(gradient / max(float(gradient.mean()), 1e-6), np.float32)
 
 
 def project_edges(edges: Edges, parameters: F64) -> F64:

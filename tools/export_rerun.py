@@ -34,41 +34,46 @@ def write_rerun(recording: Recording, path: Path) -> str:
     return f"{count} frames; open it with: rerun {path}"
 
 
-def show(recording: Recording, stream: Any) -> int:
-    """Log a run to a rerun stream; returns the number of frames. Raises DataError for a recording without frames."""
+def show(recording: Recording, stream: Any, after: int = -1) -> int:
+    """Log the frames of a run after the number `after` to a rerun stream; returns the number of all its frames. Raises DataError for a recording
+    without frames."""
     references = references_of(recording)
     if not references:
         raise DataError(str(recording.path), "holds no frames", "record a run")
     load_plugins()  # they draw their values
-    begin(stream)
-    _show_images(recording, stream)
+    if after < 0:
+        begin(stream)
+    _show_images(recording, stream, after)
     for topic in TOPICS:
         for number, value in enumerate(recording.values(topic) if topic in recording.topics else ()):
-            if topic != "map" or number % MAP_EVERY == 0 or number + 1 == recording.counts["/map"]:
+            if value.index > after and (topic != "map" or number % MAP_EVERY == 0 or number + 1 == recording.counts["/map"]):
                 at(stream, value.index, value.stamp_ns)
                 show_value(stream, value)
-    _show_truth(recording, stream)
+    _show_truth(recording, stream, after)
     return len(references)
 
 
-def _show_images(recording: Recording, stream: Any) -> None:
+def _show_images(recording: Recording, stream: Any, after: int) -> None:
     """The images, and the camera that belongs to their size."""
     import rerun
 
     by_stamp = {reference.stamp_ns: reference for reference in references_of(recording).values()}
     if "dataset" in recording.topics:
         for value in recording.values("dataset"):
-            at(stream, value.index, value.stamp_ns)
-            show_value(stream, value)
+            if value.index > after:
+                at(stream, value.index, value.stamp_ns)
+                show_value(stream, value)
         return
     for stamp_ns, data in recording.messages("/view/image"):
         reference = by_stamp[stamp_ns]
+        if reference.index <= after:
+            continue
         at(stream, reference.index, stamp_ns)
         show_pinhole(stream, reference.camera, 0.5)
         stream.log(IMAGE, rerun.EncodedImage(contents=CompressedImage.FromString(data).data, media_type="image/jpeg"))
 
 
-def _show_truth(recording: Recording, stream: Any) -> None:
+def _show_truth(recording: Recording, stream: Any, after: int) -> None:
     """The true path in the world of the run, and the error of each pose, as Foxglove's `/error`."""
     import rerun
 
@@ -77,9 +82,10 @@ def _show_truth(recording: Recording, stream: Any) -> None:
     for value in recording.values("pose") if "pose" in recording.topics else ():
         found = dict(view.messages(value))
         if "/error" in found:
-            at(stream, value.index, value.stamp_ns)
-            stream.log("error/position_m", rerun.Scalars(found["/error"].translation_m))
-            stream.log("error/rotation_deg", rerun.Scalars(found["/error"].rotation_deg))
+            if value.index > after:
+                at(stream, value.index, value.stamp_ns)
+                stream.log("error/position_m", rerun.Scalars(found["/error"].translation_m))
+                stream.log("error/rotation_deg", rerun.Scalars(found["/error"].rotation_deg))
             place = found["/view/truth"].pose.position
             true.append((place.x, place.y, place.z))
     if true:

@@ -1,7 +1,8 @@
 """Open a run in rerun: frames, features, planes, axes, the map, the surface and the estimate against the truth.
 
-Needs rerun: pip install 'trihedron[view]'. Of a recording that is being written it
-shows what there is. --web serves it to a browser until Ctrl-C, and needs no display.
+Needs rerun: pip install 'trihedron[view]'. A recording that is being written is
+followed until its run ends. --web serves it to a browser until Ctrl-C, and needs no
+display.
 `trihedron export RUN --to rerun` writes the same to a file.
 
 Example: trihedron view runs/latest
@@ -10,13 +11,20 @@ Example: trihedron view runs/latest --web
 
 from __future__ import annotations
 
+import sys
+import time
 from pathlib import Path
+from typing import Any
 
 from trihedron.pipeline.app.recorded_values import open_recording
 from trihedron.pipeline.app.viewers import keep_serving
-from trihedron.pipeline.core.errors import UsageError
+from trihedron.pipeline.core.errors import RecordingError, UsageError
+from trihedron.pipeline.record.mcap_file import in_use
+from trihedron.pipeline.record.reader import Recording
 from trihedron.tools.arguments import Parser
 from trihedron.tools.export import RECORDING
+
+POLL_S = 0.5  # between two readings of a recording that is being written
 
 
 def main(argv: list[str]) -> int:
@@ -25,7 +33,6 @@ def main(argv: list[str]) -> int:
     from trihedron.pipeline.record.foxglove_server import LOOPBACK
     from trihedron.pipeline.record.rerun_view import require_rerun
     from trihedron.pipeline.record.rerun_viewer import PORT, WEB_PORT, lacks_display, opened_rerun
-    from trihedron.tools.export_rerun import show
 
     parser = Parser("view", __name__)
     parser.add_argument("run", metavar="RUN", type=Path, help="a run folder or its recording")
@@ -36,13 +43,16 @@ def main(argv: list[str]) -> int:
     arguments = parser.parse_args(argv)
     run: Path = arguments.run
     require_rerun()
-    recording = open_recording(run / RECORDING if run.is_dir() else run)
+    path = run / RECORDING if run.is_dir() else run
+    growing = in_use(path)  # asked first: a run may end meanwhile
+    recording = open_recording(path, announce=False)
     if lacks_display() and not arguments.web:
         raise UsageError("view", "there is no display for rerun's window", f"serve it to a browser: trihedron view {run} --web")
     with opened_rerun(arguments.host, arguments.port, arguments.web_port if arguments.web else None) as viewer:
         try:
-            print(f"{show(recording, viewer.stream)} frames of {recording.path}")
-            viewer.stream.flush()
+            print(f"{_show_to_its_end(recording, growing, viewer.stream, viewer.url)} frames of {recording.path}")
+        except KeyboardInterrupt:
+            return 0
         except RuntimeError as error:  # the window was closed, for example
             raise UsageError(
                 "rerun", f"does not take the run: {str(error).strip().splitlines()[0]}", f"write a file instead: trihedron export {run} --to rerun"
@@ -50,3 +60,26 @@ def main(argv: list[str]) -> int:
         if viewer.url:
             keep_serving(viewer.url)
     return 0
+
+
+def _show_to_its_end(recording: Recording, growing: bool, stream: Any, url: str) -> int:
+    """Show a recording, and of one that is growing what is added until nobody writes any more; returns the number of frames."""
+    from trihedron.tools.export_rerun import show
+
+    path = recording.path
+    count = show(recording, stream)
+    stream.flush()
+    if growing:
+        print(f"view: {count} frames so far{f' at {url}' if url else ''}; new ones are shown until the run ends", flush=True)
+    while growing:
+        time.sleep(POLL_S)
+        growing = in_use(path)  # asked first: the last reading has everything
+        after = recording.references[-1].index - 1  # the last frame may not have been whole
+        try:
+            recording = open_recording(path, announce=False)
+        except RecordingError as error:  # of a run that was killed, for example
+            print(f"trihedron: {error}", file=sys.stderr)
+            break
+        count = show(recording, stream, after)
+        stream.flush()
+    return count

@@ -48,7 +48,7 @@ from trihedron.pipeline.run.warm_up import compilation_reported, warm_up
 
 RECORDING = "run.mcap"
 NETWORKS = tuple(f"{slot}.model" for slot in SLOTS)  # files of networks, of the plugins that run one
-READ_PATHS = ("dataset.path", "dataset.camera", "dataset.options.path", "dataset.options.camera", "load_map", *NETWORKS)
+READ_PATHS = ("dataset.path", "dataset.camera", "dataset.options.path", "dataset.options.camera", "load_map", "building.edits", *NETWORKS)
 PLAIN_PROGRESS_SECONDS = 5.0
 MAX_THREADS = 256
 
@@ -218,6 +218,8 @@ def metadata_of(config: DictConfig, overrides: list[str]) -> dict[str, str]:
         options = config.get(key.partition(".")[0])
         if isinstance(options, DictConfig) and "sha256" in options and options.get("model"):
             options.sha256 = sha256_of(options.model)  # a replay demands the same file
+    if isinstance(options := config.get("building"), DictConfig) and options.get("edits"):
+        options.edits_sha256 = sha256_of(options.edits)  # likewise
     return {
         "version": importlib.metadata.version("trihedron"),
         "commit": _commit(),

@@ -21,8 +21,9 @@ from trihedron.pipeline.run.replay import at_rate
 from trihedron.pipeline.run.results import final_trajectory
 
 
-def open_recording(path: Path) -> Recording:
-    """Open a recording; of one that is still being written, a copy of what the file holds so far. Raises RecordingError."""
+def open_recording(path: Path, announce: bool = True) -> Recording:
+    """Open a recording; of one that is still being written, a copy of what the file holds so far, which a line on stderr says. Raises
+    RecordingError."""
     if not in_use(path):
         return Recording(path)
     with TemporaryDirectory(prefix="trihedron-") as folder:
@@ -30,7 +31,8 @@ def open_recording(path: Path) -> Recording:
         count = recover(path, copy, being_written=True).messages
         found = Recording(copy)  # which stays open
     found.path = path
-    print(f"trihedron: {path} is still being written; its first {count} messages are read", file=sys.stderr)
+    if announce:
+        print(f"trihedron: {path} is still being written; its first {count} messages are read", file=sys.stderr)
     return found
 
 

@@ -14,6 +14,7 @@ PATH_KEYS = frozenset({
     "keypoints.model", "lines.model", "normals.model", "planes.model", "tracks.model", "loop.model",
 })  # fmt: skip
 LISTS = ("sequences", "alternatives")
+SYNONYMS = {"record.frames=foxglove": "record.frames=true"}  # frames are embedded in Foxglove's schemas
 PLAIN = re.compile(r"[\w./:+@%-]+", re.ASCII)  # a value that Hydra reads as it is written
 SWEPT = re.compile(r".*,|(choice|glob|sort|shuffle)\(")
 
@@ -42,7 +43,9 @@ def path_of(word: str) -> tuple[str, str] | None:
 
 
 def with_literal_paths(words: Iterable[str], sweep: bool = False) -> list[str]:
-    """Quote the values of paths, `sequences` and `alternatives` for Hydra. In a sweep `A,B` are several paths, unless one of that name exists."""
+    """Quote the values of paths, `sequences` and `alternatives` for Hydra, and replace SYNONYMS.
+
+    In a sweep `A,B` are several paths, unless one of that name exists."""
     return [_literal_word(word, sweep) for word in words]
 
 
@@ -51,7 +54,7 @@ def _literal_word(word: str, sweep: bool) -> str:
         return f"{found_list[0]}=[{','.join(quote(element) for element in list_elements(found_list[2]))}]"
     found = path_of(word)
     if found is None or not found[1]:
-        return word
+        return SYNONYMS.get(word, word)
     key, value = found
     if sweep and key != "out" and SWEPT.match(value) and not Path(value).expanduser().exists():
         return word

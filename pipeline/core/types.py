@@ -714,7 +714,8 @@ class Building(Value):
     `edge_sigma_m[j]` relative to the room (NaN = not seen); `closed` is True if every edge is on a wall.
     Of opening i: its wall, its (left, right) in metres from the wall's start, its (bottom, top) above the floor, the covariance of these four, a row
     of OPENING_KINDS, and the rooms it joins (-1 = none). `furniture` are ids of the planes of the map that are none of the building's own. Rows of
-    `support` are (row of ELEMENTS, the element, row of SUPPORTS, id or number). `note` names what is missing."""
+    `support` are (row of ELEMENTS, the element, row of SUPPORTS, id or number). `note` names what is missing. `edits` are corrections by hand, with
+    names and uses of elements, as JSON; empty without any."""
 
     T_world_building: Annotated[F64, Shape(4, 4), Rotations()]
     note: str
@@ -741,6 +742,7 @@ class Building(Value):
     opening_rooms: Annotated[I32, Shape("o", 2), IndexInto(".room_storeys", least=-1)]
     furniture: Annotated[I32, Shape("f")]
     support: Annotated[I32, Shape("n", 4)]
+    edits: str = ""
 
     @staticmethod
     def empty(index: int, stamp_ns: int, note: str, T_world_building: F64 | None = None) -> Building:

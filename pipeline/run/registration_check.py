@@ -66,12 +66,17 @@ def _edges_along_rows(depth_m: NDArray[Any]) -> NDArray[np.int64]:
     return np.asarray(np.stack([np.where(a < b, left, right), rows], axis=1)[jumps], np.int64)
 
 
-def _gradient_scores(frame: Frame, edges: NDArray[np.int64]) -> F64:
-    """The mean gradient at the edges for each scale and shift."""
-    gray = cv2.GaussianBlur(cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY).astype(np.float32), (0, 0), BLUR_PX)
+def color_gradient(frame: Frame, blur_px: float) -> F32:
+    """(h, w) magnitude of the gradient of colour, in units of its mean; the strongest are cut."""
+    gray = cv2.GaussianBlur(cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY).astype(np.float32), (0, 0), blur_px)
     gradient = cv2.magnitude(cv2.Sobel(gray, cv2.CV_32F, 1, 0), cv2.Sobel(gray, cv2.CV_32F, 0, 1))
     gradient = np.minimum(gradient, np.percentile(gradient[::4, ::4], STRONGEST))
-    gradient /= max(float(gradient.mean()), 1e-6)
+    return np.asarray(gradient / max(float(gradient.mean()), 1e-6), np.float32)
+
+
+def _gradient_scores(frame: Frame, edges: NDArray[np.int64]) -> F64:
+    """The mean gradient at the edges for each scale and shift."""
+    gradient = color_gradient(frame, BLUR_PX)
     center, (h, w) = np.array([frame.camera.cx, frame.camera.cy]), gradient.shape
     scores = []
     for scale in SCALES:

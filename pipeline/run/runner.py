@@ -5,6 +5,7 @@ The plan is in `replay`, the order of calls on several threads in `scheduler`, t
 
 from __future__ import annotations
 
+import logging
 import time
 import zlib
 from collections import deque
@@ -20,7 +21,7 @@ from trihedron.pipeline.core.errors import StageError, TrihedronError
 from trihedron.pipeline.core.graph import Graph, Stage
 from trihedron.pipeline.core.registry import check_value
 from trihedron.pipeline.core.slots import CAMERA, RNG
-from trihedron.pipeline.core.types import Map, Trajectory, Value
+from trihedron.pipeline.core.types import Frame, Map, Pose, Trajectory, Value
 from trihedron.pipeline.core.value_checks import check_together
 from trihedron.pipeline.core.wires import Wire
 from trihedron.pipeline.record.reader import TopicReader
@@ -36,7 +37,9 @@ from trihedron.pipeline.run.replay import RECORDED, Replay, plan_run
 from trihedron.pipeline.run.scheduler import Scheduler, single_threaded_libraries
 from trihedron.pipeline.run.sinks import Sink
 from trihedron.pipeline.run.state import DelayLines, StateBuffer, max_delays, recorded_delay_lines
+from trihedron.pipeline.run.time_offset_check import TimeOffsetCheck
 
+log = logging.getLogger("trihedron")
 TRIM_EVERY = 1000  # frames; it takes some 10 ms
 NodeCall = Callable[[int, Mapping[str, Any]], Any]
 FRAME_TAKEN = "dataset:"  # input of every stage of a live run: which frame it is must be known first
@@ -84,6 +87,7 @@ class Runner:
         self.accounts = Accounting(self.plan.stamps_ns, self.plan.fps, loaded if isinstance(loaded, Map) else None)
         self.result, self.timing = self.accounts.result, self.accounts.timing
         self.validation = FrameValidation(self.plan.stamps_ns, self.count if self.feed is None else 0)
+        self._time_offset = TimeOffsetCheck()
         self._sources = str(replay.recording.path) if replay is not None else "load_map" if self.initial.held else ""  # files of inputs
         self._fold_states: dict[str, Any] = {}
         self._preview_period = preview_period
@@ -135,6 +139,7 @@ class Runner:
         index, accounts = self.indices[position], self.accounts
         self.state.append(index, values)
         if accounts.take(position, index, values, self.count, position in self.validation.late):
+            self._judge_time_offset(values.get("dataset"), values.get("pose"))
             for sink in self.sinks:
                 sink.frame(index, accounts.stamps_ns[index], values, accounts.times[position])
             while self._previews:
@@ -144,6 +149,10 @@ class Runner:
         accounts.forget(position, index)
         if (position + 1) % TRIM_EVERY == 0:
             malloc_trim()
+
+    def _judge_time_offset(self, frame: Any, pose: Any) -> None:
+        if isinstance(frame, Frame) and isinstance(pose, Pose) and (found := self._time_offset(frame, pose)):
+            log.warning("%s", found)
 
     def nodes(self) -> list[Node]:
         """Return the nodes of the stages that compute, behind those of the topics that they read from a file, in topological order."""

@@ -7,8 +7,9 @@ from functools import partial
 
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Building, Frame, Map, Planes, Pose, Rotation
+from trihedron.plugins.building.edits import apply_edits
 from trihedron.plugins.building.layout import AtlantaOptions, atlanta_directions, plan_building
-from trihedron.plugins.building.views import BuildingState, add_view, preview_state
+from trihedron.plugins.building.views import BuildingState, add_view, empty_state, preview_state
 
 
 @register("building", "atlanta_layout")
@@ -18,8 +19,8 @@ class AtlantaLayout(AtlantaOptions):
     CVPR 2004, "Atlanta world"). An edge along none of the axes is turned to its own points."""
 
     def start(self) -> BuildingState:
-        """Return an empty state."""
-        return BuildingState()
+        """Return an empty state, with the corrections by hand."""
+        return empty_state(self)
 
     def add(self, state: BuildingState, frame: Frame, planes: Planes, rotation: Rotation | None, pose: Pose, map: Map | None) -> BuildingState:
         """Retain the frame if it became a keyframe."""
@@ -31,4 +32,4 @@ class AtlantaLayout(AtlantaOptions):
 
     def finish(self, state: BuildingState, map: Map | None) -> Building:
         """Return the plan at the final poses."""
-        return plan_building(self, state, map, partial(atlanta_directions, self))
+        return apply_edits(plan_building(self, state, map, partial(atlanta_directions, self)), state.edits)

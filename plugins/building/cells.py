@@ -9,8 +9,9 @@ from trihedron.pipeline.core.options import PositiveFloat
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Bool, Building, Frame, Map, Planes, Pose, Rotation
 from trihedron.plugins.building.cell_complex import Cells, cut_cells
+from trihedron.plugins.building.edits import apply_edits
 from trihedron.plugins.building.layout import AtlantaOptions, atlanta_directions, plan_building
-from trihedron.plugins.building.views import BuildingState, add_view, preview_state
+from trihedron.plugins.building.views import BuildingState, add_view, empty_state, preview_state
 
 
 @register("building", "cells")
@@ -22,8 +23,8 @@ class CellComplex(AtlantaOptions):
     open_border_m: PositiveFloat = 0.05  # area in m² that a metre of border without a wall costs
 
     def start(self) -> BuildingState:
-        """Return an empty state."""
-        return BuildingState()
+        """Return an empty state, with the corrections by hand."""
+        return empty_state(self)
 
     def add(self, state: BuildingState, frame: Frame, planes: Planes, rotation: Rotation | None, pose: Pose, map: Map | None) -> BuildingState:
         """Retain the frame if it became a keyframe."""
@@ -35,7 +36,7 @@ class CellComplex(AtlantaOptions):
 
     def finish(self, state: BuildingState, map: Map | None) -> Building:
         """Return the plan at the final poses."""
-        return plan_building(self, state, map, partial(atlanta_directions, self), self._inside)
+        return apply_edits(plan_building(self, state, map, partial(atlanta_directions, self), self._inside), state.edits)
 
     def _inside(self, cells: Cells) -> Bool:
         """Return the cells (n,) on the source's side of the cut that a ray passed."""

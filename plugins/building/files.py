@@ -18,6 +18,7 @@ from trihedron.pipeline.core.files import new_file, write_file
 from trihedron.pipeline.core.linalg import norm
 from trihedron.pipeline.core.registry import register_files
 from trihedron.pipeline.core.types import ELEMENTS, F64, OPENING_KINDS, SUPPORTS, Building
+from trihedron.plugins.building.edits import missing_edits
 from trihedron.plugins.building.geometry import (
     CEILING,
     MODEL_COLORS,
@@ -32,6 +33,7 @@ from trihedron.plugins.building.geometry import (
     wall_corners,
     wall_pieces,
 )
+from trihedron.plugins.building.labels import LISTS, id_of, label_of, name_of, parse_edits, plain_edits, use_of
 
 JSON, SVG, DXF, GLB = "building.json", "floorplan.svg", "floorplan.dxf", "building.glb"
 SCHEMA_VERSION = 1
@@ -39,12 +41,12 @@ SCHEMA_VERSION = 1
 
 @register_files("building")
 def write_building(out: Path, building: Building) -> list[str]:
-    """Write the files of a run folder and return a line that describes them."""
-    write_file(out / JSON, json.dumps(building_json(building), indent=1) + "\n")
-    write_file(out / SVG, floorplan_svg(building))
+    """Write the files of a run folder; returns a line that describes them, and one for each correction by hand that no element has."""
+    write_json(out / JSON, building)
+    write_svg(out / SVG, building)
     write_dxf(out / DXF, building)
     write_glb(out / GLB, building)
-    return [summary(building)]
+    return [summary(building), *missing_edits(building)]
 
 
 def summary(building: Building) -> str:
@@ -53,6 +55,11 @@ def summary(building: Building) -> str:
 
 
 # JSON.
+
+
+def write_json(path: Path, building: Building) -> None:
+    """Write all elements as JSON."""
+    write_file(path, json.dumps(building_json(building), indent=1) + "\n")
 
 
 def building_json(building: Building) -> dict[str, Any]:
@@ -67,7 +74,13 @@ def building_json(building: Building) -> dict[str, Any]:
         "rooms": [_room(building, k) for k in range(len(building.areas_m2))],
         "openings": [_opening(building, k) for k in range(len(building.spans_m))],
         "furniture_planes": building.furniture.tolist(),
+        "count": dict(zip(LISTS.values(), (len(building.walls_m), len(building.areas_m2), len(building.spans_m)))),
+        "edits": plain_edits(parse_edits(building.edits)),
     }
+
+
+def _named(building: Building, element: str, k: int) -> dict[str, str]:
+    return {"id": id_of(building, element, k), "name": name_of(building, element, k)}
 
 
 def _numbers(array: Any) -> Any:
@@ -98,7 +111,8 @@ def _wall(building: Building, k: int) -> dict[str, Any]:
     start, end = building.walls_m[k]
     offset, thickness, angle = _sigmas(building.wall_covariance[k])
     return {
-        "storey": int(building.wall_storeys[k]), "start": _numbers(start), "end": _numbers(end), "length_m": _numbers(norm(end - start)),
+        **_named(building, "wall", k), "storey": int(building.wall_storeys[k]),
+        "start": _numbers(start), "end": _numbers(end), "length_m": _numbers(norm(end - start)),
         "thickness_m": _numbers(building.thickness_m[k]), "offset_sigma_m": offset, "thickness_sigma_m": thickness, "direction_sigma_rad": angle,
         "unseen": [_numbers(row[1:]) for row in building.unseen if int(row[0]) == k], "support": _support(building, "wall", k),
     }  # fmt: skip
@@ -107,7 +121,8 @@ def _wall(building: Building, k: int) -> dict[str, Any]:
 def _room(building: Building, k: int) -> dict[str, Any]:
     rings = [(int(a), int(b)) for room, a, b in building.loops if room == k]
     return {
-        "storey": int(building.room_storeys[k]), "polygon": _numbers(building.corners_m[slice(*rings[0])]),
+        **_named(building, "room", k), "use": use_of(building, k), "storey": int(building.room_storeys[k]),
+        "polygon": _numbers(building.corners_m[slice(*rings[0])]),
         "holes": [_numbers(building.corners_m[a:b]) for a, b in rings[1:]],
         "walls": [building.corner_walls[a:b].tolist() for a, b in rings], "area_m2": _numbers(building.areas_m2[k]),
         "area_sigma_m2": _numbers(np.sqrt(building.area_variance[k])), "closed": bool(building.closed[k]), "support": _support(building, "room", k),
@@ -116,7 +131,8 @@ def _room(building: Building, k: int) -> dict[str, Any]:
 
 def _opening(building: Building, k: int) -> dict[str, Any]:
     return {
-        "kind": OPENING_KINDS[building.opening_kinds[k]], "wall": int(building.opening_walls[k]), "rooms": building.opening_rooms[k].tolist(),
+        **_named(building, "opening", k), "kind": OPENING_KINDS[building.opening_kinds[k]],
+        "wall": int(building.opening_walls[k]), "rooms": building.opening_rooms[k].tolist(),
         "span_m": _numbers(building.spans_m[k]), "width_m": _numbers(np.ptp(building.spans_m[k])),
         "heights_m": _numbers(building.opening_heights_m[k]), "sigma_m": _sigmas(building.opening_covariance[k]),
         "support": _support(building, "opening", k),
@@ -134,6 +150,11 @@ text{font-family:Helvetica,Arial,sans-serif;fill:#222;text-anchor:middle}
 .swing{fill:none;stroke:#777;stroke-width:1}.leaf{stroke:#555;stroke-width:2}.glass{fill:#fff;stroke:#38c;stroke-width:1.5}
 .name{font-size:15px;font-weight:bold}.area{font-size:13px}.small{font-size:9px}.length{font-size:10px;fill:#666}.note{font-size:12px;text-anchor:start}
 """
+
+
+def write_svg(path: Path, building: Building) -> None:
+    """Write the plan as SVG."""
+    write_file(path, floorplan_svg(building))
 
 
 def floorplan_svg(building: Building) -> str:
@@ -163,9 +184,10 @@ def _svg_storey(building: Building, storey: int, at: Any) -> list[str]:
     out = []
     for room in rooms_on(building, storey):
         rings = [at(ring) for ring in rings_of(building, room)]
-        out.append(f'<path class="room" fill-rule="evenodd" d="{" ".join(_path(ring) for ring in rings)}"/>')
+        out += _svg_group(building, "room", room, [f'<path class="room" fill-rule="evenodd" d="{" ".join(_path(ring) for ring in rings)}"/>'])
     for wall in np.nonzero(building.wall_storeys == storey)[0]:
-        out += [f'<path class="{"wall" if piece.seen else "unseen"}" d="{_path(at(piece.corners))}"/>' for piece in wall_pieces(building, wall)]
+        pieces = [f'<path class="{"wall" if piece.seen else "unseen"}" d="{_path(at(piece.corners))}"/>' for piece in wall_pieces(building, wall)]
+        out += _svg_group(building, "wall", int(wall), pieces)
     out += [f'<path class="wall" d="{_path(at(corner))}"/>' for room in rooms_on(building, storey) for corner in wall_corners(building, room)]
     for room in rooms_on(building, storey):
         for edge in open_edges(building, room):
@@ -173,10 +195,16 @@ def _svg_storey(building: Building, storey: int, at: Any) -> list[str]:
             out.append(f'<line class="unseen" x1="{x0:.1f}" y1="{y0:.1f}" x2="{x1:.1f}" y2="{y1:.1f}"/>')
     for opening, wall in enumerate(building.opening_walls):
         if building.wall_storeys[wall] == storey:
-            out += _svg_opening(building, opening, at)
+            out += _svg_group(building, "opening", opening, _svg_opening(building, opening, at))
     for room in rooms_on(building, storey):
         out += _svg_texts(building, room, at)
     return out
+
+
+def _svg_group(building: Building, element: str, k: int, parts: list[str]) -> list[str]:
+    """Group what is drawn of an element under its id, with its name as title."""
+    title = " – ".join(escape(text) for text in (label_of(building, element, k), use_of(building, k) if element == "room" else "") if text)
+    return [f'<g id="{id_of(building, element, k)}"><title>{title}</title>', *parts, "</g>"]
 
 
 def _path(points: F64) -> str:
@@ -218,9 +246,9 @@ def _svg_texts(building: Building, room: int, at: Any) -> list[str]:
 
     x, y = at(label_place(building, room))
     small = " small" if np.ptp(rings_of(building, room)[0], axis=0).min() < NARROW_M else ""
-    name, area, below = f"room {room}", area_text(building, room), 11.0 if small else 17.0
+    name, area, below = label_of(building, "room", room), area_text(building, room), 11.0 if small else 17.0
     out = [
-        f'<text class="name{small}" x="{x:.1f}" y="{y:.1f}">{name}</text>',
+        f'<text class="name{small}" x="{x:.1f}" y="{y:.1f}">{escape(name)}</text>',
         f'<text class="area{small}" x="{x:.1f}" y="{y + below:.1f}">{area}</text>',
     ]
     half = max(len(name) * LETTERS_PX["small" if small else "name"], len(area) * LETTERS_PX["small" if small else "area"]) / 2.0
@@ -296,7 +324,7 @@ def write_dxf(path: Path, building: Building) -> None:
                     space.add_lwpolyline((building.corners_m[a:b] + shift).tolist(), close=True, dxfattribs={"layer": "ROOMS"})
             for p, q in open_edges(building, room):
                 space.add_line((p + shift).tolist(), (q + shift).tolist(), dxfattribs={"layer": "UNSEEN"})
-            text = f"room {room}: {area_text(building, room)}"
+            text = " – ".join(filter(None, (label_of(building, "room", room), use_of(building, room)))) + f": {area_text(building, room)}"
             label = space.add_text(text, height=0.15, dxfattribs={"layer": "TEXT"})
             label.set_placement((label_place(building, room) + shift).tolist(), align=TextEntityAlignment.MIDDLE_CENTER)
         for wall in np.nonzero(building.wall_storeys == storey)[0]:
@@ -308,6 +336,9 @@ def write_dxf(path: Path, building: Building) -> None:
                 layer = "WINDOWS" if OPENING_KINDS[building.opening_kinds[opening]] == "window" else "DOORS"
                 corners = quad(building, int(wall), *building.spans_m[opening]) + shift
                 space.add_lwpolyline(corners.tolist(), close=True, dxfattribs={"layer": layer})
+                if name := name_of(building, "opening", opening):
+                    label = space.add_text(name, height=0.1, dxfattribs={"layer": "TEXT"})
+                    label.set_placement(corners.mean(axis=0).tolist(), align=TextEntityAlignment.MIDDLE_CENTER)
     with new_file(path) as new:
         document.saveas(new)
 

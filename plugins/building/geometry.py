@@ -17,6 +17,7 @@ from trihedron.pipeline.core.geometry import transform
 from trihedron.pipeline.core.linalg import matmul, norm
 from trihedron.pipeline.core.registry import register_drawing
 from trihedron.pipeline.core.types import F64, I32, OPENING_KINDS, Building
+from trihedron.plugins.building.labels import label_of
 
 SHEET_M = 0.06  # thickness that a wall is drawn with where its other face was not seen
 NOMINAL_M = 2.5  # of a storey whose floor or ceiling was not seen
@@ -139,11 +140,6 @@ def label_place(building: Building, room: int) -> F64:
     return np.asarray(rings[0].mean(axis=0), np.float64)
 
 
-def opening_name(building: Building, opening: int) -> str:
-    """Return the name of an opening: its kind and number."""
-    return f"{OPENING_KINDS[building.opening_kinds[opening]]} {opening}"
-
-
 # In 3D.
 
 
@@ -222,7 +218,7 @@ def drawing_of_building(building: Building) -> Drawing:
     for room, (area, storey) in enumerate(zip(building.areas_m2, building.room_storeys)):
         ring, height = rings_of(building, room)[0], float(np.nan_to_num(building.storeys[storey, 0]))
         closed = np.column_stack([ring, np.full(len(ring), height)])[[*range(len(ring)), 0]]
-        outlines.append(Outline(f"room_{room}", f"room {room}: {area:.1f} m²", transform(T, closed)))
+        outlines.append(Outline(f"room_{room}", f"{label_of(building, 'room', room)}: {area:.1f} m²", transform(T, closed)))
     return Drawing(tuple(solids), tuple(outlines))
 
 

@@ -16,7 +16,8 @@ from trihedron.pipeline.core.files import new_file
 from trihedron.pipeline.core.libraries import imports_of
 from trihedron.pipeline.core.linalg import norm
 from trihedron.pipeline.core.types import F64, Building
-from trihedron.plugins.building.geometry import SHEET_M, opening_name, rings_of, rooms_on, storey_levels
+from trihedron.plugins.building.geometry import SHEET_M, rings_of, rooms_on, storey_levels
+from trihedron.plugins.building.labels import label_of, use_of
 
 IFC = "model.ifc"
 SLAB_M = 0.2  # thickness of a slab, but between two storeys, where it was measured
@@ -125,7 +126,8 @@ class _IfcWriter:
 
     def _space(self, room: int, storey: Any, low: float, high: float) -> None:
         space = self._entity("IfcSpace", f"room {room}")
-        space.PredefinedType, space.LongName = "INTERNAL", f"room {room}"
+        space.PredefinedType, space.LongName = "INTERNAL", label_of(self.building, "room", room)
+        space.ObjectType = use_of(self.building, room) or None
         self._aggregate(space, storey)
         self._place(space, np.array([0.0, 0.0, low]), np.array([1.0, 0.0]))
         self._solid(space, rings_of(self.building, room), high - low)
@@ -151,7 +153,7 @@ class _IfcWriter:
         low, high = storey_levels(self.building, int(self.building.wall_storeys[k]))
         measured, length = bool(np.isfinite(thickness)), float(norm(end - start))
         depth = thickness if measured else SHEET_M
-        wall = self._entity("IfcWall", f"wall {k}")
+        wall = self._entity("IfcWall", label_of(self.building, "wall", k))
         self.api.spatial.assign_container(self.file, products=[wall], relating_structure=storey)
         self._place(wall, np.array([*start, low]), (end - start) / max(length, 1e-9))
         self._solid(wall, [np.array([[0.0, -depth], [length, -depth], [length, 0.0], [0.0, 0.0]])], high - low)
@@ -167,7 +169,7 @@ class _IfcWriter:
         along = (end - start) / max(float(norm(end - start)), 1e-9)
         low, _ = storey_levels(self.building, int(self.building.wall_storeys[number]))
         (left, right), (bottom, top) = self.building.spans_m[k], self.building.opening_heights_m[k]
-        opening = self._entity("IfcOpeningElement", opening_name(self.building, k))
+        opening = self._entity("IfcOpeningElement", label_of(self.building, "opening", k))
         opening.PredefinedType = "OPENING"
         self.api.feature.add_feature(self.file, feature=opening, element=wall)
         corner = start + left * along + MARGIN_M * np.array([-along[1], along[0]])

@@ -6,11 +6,12 @@ from dataclasses import dataclass
 
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Building, Frame, Map, Planes, Pose, Rotation
+from trihedron.plugins.building.edits import apply_edits
 from trihedron.plugins.building.evidence import Evidence
 from trihedron.plugins.building.faces import slanted_directions
 from trihedron.plugins.building.layout import AXES, plan_building
 from trihedron.plugins.building.levels import Storey
-from trihedron.plugins.building.views import BuildingState, LayoutOptions, add_view, preview_state
+from trihedron.plugins.building.views import BuildingState, LayoutOptions, add_view, empty_state, preview_state
 
 APART_DEG, LEAST_M2 = 6.0, 3.0  # from the axes, and area of tall points of all views, for which a slanted wall is mentioned
 
@@ -21,8 +22,8 @@ class ManhattanLayout(LayoutOptions):
     """Cut the plan along the faces of walls in the two horizontal Manhattan axes; what rays passed is inside, what tall faces part are two rooms."""
 
     def start(self) -> BuildingState:
-        """Return an empty state."""
-        return BuildingState()
+        """Return an empty state, with the corrections by hand."""
+        return empty_state(self)
 
     def add(self, state: BuildingState, frame: Frame, planes: Planes, rotation: Rotation | None, pose: Pose, map: Map | None) -> BuildingState:
         """Retain the frame if it became a keyframe."""
@@ -34,7 +35,7 @@ class ManhattanLayout(LayoutOptions):
 
     def finish(self, state: BuildingState, map: Map | None) -> Building:
         """Return the plan at the final poses."""
-        return plan_building(self, state, map, lambda evidence, storey: AXES, remark=slanted_walls)
+        return apply_edits(plan_building(self, state, map, lambda evidence, storey: AXES, remark=slanted_walls), state.edits)
 
 
 def slanted_walls(evidence: Evidence, storey: Storey) -> str:

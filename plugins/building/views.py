@@ -10,7 +10,9 @@ import numpy as np
 from trihedron.pipeline.core.linalg import inv, matmul, norm
 from trihedron.pipeline.core.options import PositiveFloat, Range
 from trihedron.pipeline.core.types import F64, LOST, Frame, Map, Planes, Pose, Rotation
+from trihedron.plugins.building.edits import read_edits
 from trihedron.plugins.building.evidence import LEVEL_DEG, UPRIGHT_DEG, Evidence
+from trihedron.plugins.building.labels import Edit
 from trihedron.plugins.building.levels import LEAST_FLOOR_M2, lowest_floor
 from trihedron.plugins.shared.keyframe_views import KeyframeView, view_of
 
@@ -27,6 +29,8 @@ class LayoutOptions:
     max_sigma_m: PositiveFloat = 0.05  # depth less certain than this is not used
     least_room_m2: PositiveFloat = 1.0
     least_wall_m: PositiveFloat = 0.4  # of tall face, for which there is a wall
+    edits: str = ""  # a building.json that was corrected by hand: what was deleted, added or named there is so again
+    edits_sha256: str = ""  # that it must have; a recording states that of its run
 
 
 @dataclass
@@ -39,8 +43,14 @@ class BuildingState:
     first: F64 | None = None  # T_world_camera
     map: Map | None = None  # of the last frame
     keyframes: int = 0
+    edits: tuple[Edit, ...] = ()  # made by hand
     index: int = 0
     stamp_ns: int = 0
+
+
+def empty_state(options: LayoutOptions) -> BuildingState:
+    """Return the state before the first frame, with the corrections by hand. Raises DataError or ConfigError for their file."""
+    return BuildingState(edits=read_edits(options.edits, options.edits_sha256))
 
 
 def add_view(

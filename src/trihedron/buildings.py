@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,7 +16,11 @@ from trihedron.pipeline.core.described import Described
 from trihedron.pipeline.core.errors import DataError, UsageError
 from trihedron.pipeline.core.linalg import matmul, norm
 from trihedron.pipeline.core.types import F64, OPENING_KINDS, Pose
-from trihedron.plugins.building.geometry import rings_of
+from trihedron.plugins.building.geometry import quad, rings_of
+from trihedron.plugins.building.labels import name_of, use_of
+
+if TYPE_CHECKING:
+    import shapely
 
 OPEN_SIGMA_M = 0.05  # of an edge that nothing bounds, and of where a wall was last seen
 PARALLEL_DEG = 5.0  # between walls that have a distance
@@ -47,7 +53,8 @@ class Storey:
 @dataclass(frozen=True)
 class Wall(Described):
     """A wall: the ends (2,) of its face, with the side it was seen from on the left; length, thickness and the standard deviation of the face's
-    offset, m; the stretches (n, 2) along it that were not seen."""
+    offset, m; the stretches (n, 2) along it that were not seen; its corners (4, 2) on the plans, which draw a wall whose other face was not seen 6 cm
+    thick."""
 
     number: int
     storey: int
@@ -57,6 +64,13 @@ class Wall(Described):
     thickness_m: Measurement
     offset_sigma_m: float
     unseen: F64
+    corners: F64
+    name: str = ""
+
+    @cached_property
+    def outline(self) -> shapely.Polygon:
+        """The wall on the plan, openings included."""
+        return _polygon(self.corners)
 
     @property
     def along(self) -> F64:
@@ -86,18 +100,26 @@ class Room(Described):
 
     number: int
     storey: int
-    polygon: F64
+    corners: F64
     holes: tuple[F64, ...]
     edges: tuple[Edge, ...]
     area_m2: Measurement
     perimeter_m: Measurement
     openings: tuple[int, ...]
     closed: bool
+    name: str = ""
+    use: str = ""
+
+    @cached_property
+    def polygon(self) -> shapely.Polygon:
+        """The room on the plan, with its holes."""
+        return _polygon(self.corners, self.holes)
 
 
 @dataclass(frozen=True)
 class Opening(Described):
-    """A `door`, `passage` or `window` in a wall: middle (3,) in the building's frame, width and height, m, and the rooms it joins (None: none)."""
+    """A `door`, `passage` or `window` in a wall: middle (3,) in the building's frame, width and height, m, the rooms it joins (None: none), and its
+    corners (4, 2) on the plans."""
 
     number: int
     kind: str
@@ -106,6 +128,13 @@ class Opening(Described):
     width_m: Measurement
     height_m: Measurement
     rooms: tuple[int | None, int | None]
+    corners: F64
+    name: str = ""
+
+    @cached_property
+    def outline(self) -> shapely.Polygon:
+        """The stretch of the wall on the plan."""
+        return _polygon(self.corners)
 
 
 class Building:
@@ -163,7 +192,7 @@ class Building:
         for room in self.rooms:
             floor, ceiling = self.plan.storeys[room.storey]
             within = not z < floor - BELOW_M and not z > ceiling  # NaN: any height
-            if within and shapely.contains_xy(shapely.Polygon(room.polygon, room.holes), x, y):
+            if within and shapely.contains_xy(room.polygon, x, y):
                 return room
         return None
 
@@ -205,16 +234,101 @@ class Building:
             DataError: a file cannot be written.
         """
         from trihedron.plugins.building.files import write_building
-        from trihedron.plugins.building.ifc import IFC, has_ifc, write_ifc
+        from trihedron.plugins.building.ifc import IFC, has_ifc
 
         out = Path(folder).expanduser()
-        try:
+        with _writing(out, "give another folder"):
             out.mkdir(parents=True, exist_ok=True)
             write_building(out, self.plan)
-            if has_ifc():
-                write_ifc(out / IFC, self.plan)
-        except OSError as error:
-            raise DataError(str(error.filename or out), f"cannot be written: {error.strerror}", "give another folder") from error
+        if has_ifc():
+            self.to_ifc(out / IFC)
+
+    def to_json(self, path: str | Path) -> Path:
+        """Write all elements as building.json has them.
+
+        Args:
+            path: the file; it is overwritten.
+
+        Returns:
+            The path.
+
+        Raises:
+            DataError: the file cannot be written.
+        """
+        from trihedron.plugins.building.files import write_json
+
+        return self._write(path, write_json)
+
+    def to_svg(self, path: str | Path) -> Path:
+        """Write the floor plan as SVG.
+
+        Args:
+            path: the file; it is overwritten.
+
+        Returns:
+            The path.
+
+        Raises:
+            DataError: the file cannot be written.
+        """
+        from trihedron.plugins.building.files import write_svg
+
+        return self._write(path, write_svg)
+
+    def to_dxf(self, path: str | Path) -> Path:
+        """Write the floor plan as DXF.
+
+        Args:
+            path: the file; it is overwritten.
+
+        Returns:
+            The path.
+
+        Raises:
+            DataError: the file cannot be written.
+        """
+        from trihedron.plugins.building.files import write_dxf
+
+        return self._write(path, write_dxf)
+
+    def to_glb(self, path: str | Path) -> Path:
+        """Write the model as binary glTF.
+
+        Args:
+            path: the file; it is overwritten.
+
+        Returns:
+            The path.
+
+        Raises:
+            DataError: the file cannot be written.
+        """
+        from trihedron.plugins.building.files import write_glb
+
+        return self._write(path, write_glb)
+
+    def to_ifc(self, path: str | Path) -> Path:
+        """Write the model as IFC4.
+
+        Args:
+            path: the file; it is overwritten.
+
+        Returns:
+            The path.
+
+        Raises:
+            DataError: the file cannot be written.
+            LibraryError: ifcopenshell is not installed.
+        """
+        from trihedron.plugins.building.ifc import write_ifc
+
+        return self._write(path, write_ifc)
+
+    def _write(self, path: str | Path, write: Callable[[Path, types.Building], None]) -> Path:
+        file = Path(path).expanduser()
+        with _writing(file, "give a path in a folder that exists"):
+            write(file, self.plan)
+        return file
 
     def __repr__(self) -> str:
         return repr(self.plan)
@@ -250,7 +364,8 @@ class Building:
         rows = self.plan.unseen[self.plan.unseen[:, 0].astype(int) == k]
         return Wall(
             k, int(self.plan.wall_storeys[k]), start, end, Measurement(float(norm(end - start)), sigma),
-            Measurement(float(self.plan.thickness_m[k]), thickness), offset, rows[:, 1:],
+            Measurement(float(self.plan.thickness_m[k]), thickness), offset, rows[:, 1:], quad(self.plan, k, 0.0, float(norm(end - start))),
+            name_of(self.plan, "wall", k),
         )  # fmt: skip
 
     def _end_sigma(self, wall: int, end: F64) -> float:
@@ -277,7 +392,7 @@ class Building:
         openings = tuple(int(o) for o in np.nonzero((self.plan.opening_rooms == k).any(axis=1))[0])
         return Room(
             k, int(self.plan.room_storeys[k]), outer, tuple(holes), tuple(edges), area, self._perimeter(first, stop), openings,
-            bool(self.plan.closed[k]),
+            bool(self.plan.closed[k]), name_of(self.plan, "room", k), use_of(self.plan, k),
         )  # fmt: skip
 
     def _edges(self, a: int, b: int) -> list[Edge]:
@@ -313,7 +428,25 @@ class Building:
         a, b = (int(room) if room >= 0 else None for room in self.plan.opening_rooms[k])
         width = Measurement(float(right - left), float(np.hypot(sigma[0], sigma[1])))
         height = Measurement(float(top - bottom), float(np.hypot(sigma[2], sigma[3])))
-        return Opening(k, OPENING_KINDS[self.plan.opening_kinds[k]], wall.number, middle, width, height, (a, b))
+        corners = quad(self.plan, wall.number, float(left), float(right))
+        return Opening(
+            k, OPENING_KINDS[self.plan.opening_kinds[k]], wall.number, middle, width, height, (a, b), corners, name_of(self.plan, "opening", k)
+        )
+
+
+@contextmanager
+def _writing(path: Path, cure: str) -> Iterator[None]:
+    """Turn errors of writing into a DataError."""
+    try:
+        yield
+    except OSError as error:
+        raise DataError(str(error.filename or path), f"cannot be written: {error.strerror}", cure) from error
+
+
+def _polygon(corners: F64, holes: tuple[F64, ...] = ()) -> shapely.Polygon:
+    import shapely
+
+    return shapely.Polygon(corners, holes)
 
 
 def _turns(ring: F64) -> F64:

@@ -11,15 +11,19 @@ if TYPE_CHECKING:
     from trihedron.pipeline.record.reader import Recording
 
 
-def building_of(recording: Recording, plugin: str | None = None) -> Building:
-    """Return the recorded building, or the one that a plugin (default: manhattan_layout) makes of the recording. Raises DataError."""
+def building_of(recording: Recording, plugin: str | None = None, edits: str = "") -> Building:
+    """Return the recorded building, or the one that a plugin (default: manhattan_layout) makes of the recording, with the corrections in a file
+    `edits`. Raises DataError."""
     from trihedron.pipeline.core.types import Building
+    from trihedron.plugins.building.edits import apply_edits, read_edits
+
+    corrections = read_edits(edits)
 
     if plugin is None and "building" in recording.topics:
         for value in recording.values("building"):
             if isinstance(value, Building):
-                return value
-    return building_by(recording, plugin or "manhattan_layout")
+                return apply_edits(value, corrections)
+    return apply_edits(building_by(recording, plugin or "manhattan_layout"), corrections)
 
 
 def building_by(recording: Recording, name: str) -> Building:

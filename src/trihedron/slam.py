@@ -120,6 +120,7 @@ class Slam:
         self._last = -1  # position of the last frame pushed
         self._settled = -1  # and of the last one with which all stages are done
         self._last_ns: int | None = None
+        self._plan: tuple[int, Building | None] = 0, None  # the last one returned, and the time of the last frame then
         self._failure: BaseException | None = None
         self._ended = self._closed = False
         self._topics = recorded_topics(self._config, graph, None)
@@ -234,13 +235,26 @@ class Slam:
         surface: Surface = self._fold("surface")
         return surface
 
-    def building(self) -> Building:
+    @_of_one_thread
+    def building(self, max_age_s: float = 1.0) -> Building:
         """Return the plan of the building so far: before `close`, of some of the keyframes only.
+
+        Args:
+            max_age_s: until a frame that is so much later, in seconds of the frames' times, the last plan is returned again, which costs no time; 0
+                makes each anew.
+
+        Returns:
+            The plan; the final one after `close`.
 
         Raises:
             ConfigError: `building` is not among the outputs.
         """
-        return Building(self._fold("building", preview=True))
+        last_ns = self._last_ns or 0
+        made_ns, plan = self._plan
+        if plan is None or self._closed or last_ns - made_ns >= 1e9 * max_age_s:
+            plan = Building(self._fold("building", preview=True))
+            self._plan = last_ns, plan
+        return plan
 
     @_of_one_thread
     def _fold(self, name: str, preview: bool = False) -> Any:

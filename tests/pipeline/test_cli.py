@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 import yaml
+from mcap.reader import make_reader
 
 from trihedron.datasets.simulation.synthetic import Synthetic
 from trihedron.pipeline.app import execute
@@ -190,6 +191,16 @@ def test_a_replay_finds_the_data_from_another_folder(tmp_path, monkeypatch):
     assert main(["run", "replay=../again/run.mcap", "only=[keypoints]", "out=replayed"]) == 0
     expected = list(Recording("../again/run.mcap").messages("/keypoints"))
     assert list(Recording("replayed/run.mcap").messages("/keypoints")) == expected
+
+
+@pytest.mark.parametrize("value", ["true", "foxglove"])
+def test_frames_are_embedded_in_foxgloves_schemas(value, tmp_path):
+    words = ["dataset.length=2", "dataset.width=160", "dataset.height=120", f"record.frames={value}", f"out={tmp_path}"]
+    assert main(["run", *words]) == 0
+    with (tmp_path / "run.mcap").open("rb") as file:
+        schemas = {channel.topic: schema.name for schema, channel, _ in make_reader(file).iter_messages()}
+    assert {schemas[topic] for topic in schemas if topic.startswith("/dataset")} == {"foxglove.CompressedImage", "foxglove.RawImage"}
+    assert (tmp_path / ".hydra/config.yaml").read_text().count("frames: true") == 1
 
 
 def test_unreadable_frames_are_skipped_and_summarised(capsys, tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import signal
 import socket
@@ -13,7 +14,7 @@ import threading
 import time
 import urllib.request
 from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
@@ -28,12 +29,14 @@ from trihedron.datasets.simulation.synthetic import Synthetic
 from trihedron.pipeline.app.cli import main
 from trihedron.pipeline.app.viewers import Viewer
 from trihedron.pipeline.core.types import Map, Surface
+from trihedron.pipeline.record import rerun_viewer
 from trihedron.pipeline.record.foxglove_server import FoxgloveServer
 from trihedron.pipeline.record.rerun_viewer import RerunViewer
 from trihedron.pipeline.record.writer import RecordingWriter
 from trihedron.pipeline.run.rerun_sink import WAITING, RerunSink
 from trihedron.pipeline.run.runner import Runner
 from trihedron.pipeline.run.sinks import MemorySink
+from trihedron.tools import view
 
 sys.path.insert(0, str(Path(__file__).parent))
 from toys import ToySurface, toy_graph
@@ -391,3 +394,80 @@ def test_rerun_is_served_to_this_machine_until_the_end(tmp_path: Path, capsys: p
         assert b"rerun" in page(url).lower() and kept.end(signal.SIGINT) == 0
     finally:
         kept.process.kill()
+
+
+class Shown:
+    """A stream that only counts the frames at whose time something was logged."""
+
+    def __init__(self) -> None:
+        self.frames: list[int] = []
+
+    def set_time(self, timeline: str, *, sequence: int | None = None, **_: object) -> None:
+        self.frames += [] if sequence is None else [sequence]
+
+    def __getattr__(self, name: str) -> Any:
+        return lambda *_, **__: None
+
+
+def test_a_recording_that_grows_is_shown_to_its_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("rerun")
+    shown, path = Shown(), tmp_path / "run" / "run.mcap"
+    monkeypatch.setattr(rerun_viewer, "opened_rerun", lambda host, port, web_port: nullcontext(rerun_viewer.RerunViewer(shown, "http://page")))
+    monkeypatch.setattr(view, "keep_serving", lambda url: print(f"kept {url}"))
+    words = ["dataset.width=160", "dataset.height=120", "dataset.length=60", "real_time=true", "dataset.fps=10", f"out={path.parent}"]
+    program = "import sys; from trihedron.pipeline.app.cli import main; sys.exit(main(['run', *sys.argv[1:]]))"
+    writing = subprocess.Popen([sys.executable, "-c", program, *words], stdout=subprocess.DEVNULL)
+    try:
+        while not path.is_file() or path.stat().st_size < 30_000:
+            assert writing.poll() is None
+            time.sleep(0.05)
+        assert main(["view", str(path.parent), "--web"]) == 0
+        assert writing.wait(60) == 0
+    finally:
+        writing.kill()
+    printed = capsys.readouterr()
+    assert printed.err == ""
+    lines = rf"view: (\d+) frames so far at http://page; new ones are shown until the run ends\n60 frames of {path}\nkept http://page\n"
+    so_far = re.fullmatch(lines, printed.out)
+    assert so_far is not None and int(so_far[1]) < 60 and set(shown.frames) == set(range(60))
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="children are read from /proc")
+def test_a_frozen_rerun_does_not_hold_a_run_that_is_ended(tmp_path: Path) -> None:
+    """The server of the page stands still (SIGSTOP) in the middle of the run, beside a client that connects and never reads."""
+    pytest.importorskip("rerun")
+    port, web_port = free_port(), free_port()
+    words = ["view=rerun", "view.web=true", f"view.port={port}", f"view.web_port={web_port}", f"out={tmp_path}"]
+    words += ["dataset.width=160", "dataset.height=120", "dataset.length=3000"]
+    program = "import sys; from trihedron.pipeline.app.cli import main; sys.exit(main(['run', *sys.argv[1:]]))"
+    run = subprocess.Popen([sys.executable, "-c", program, *words], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    path, frozen = tmp_path / "run.mcap", []
+    try:
+        while not path.is_file() or path.stat().st_size < 100_000:
+            assert run.poll() is None
+            time.sleep(0.05)
+        with socket.create_connection(("127.0.0.1", port), timeout=5):
+            frozen = descendants(run.pid)
+            for process in frozen:
+                os.kill(process, signal.SIGSTOP)
+            time.sleep(2.0)
+            run.send_signal(signal.SIGTERM)
+            _, errors = run.communicate(timeout=30)
+        for number in (port, web_port):  # the server has not outlived the run
+            with pytest.raises(OSError):
+                socket.create_connection(("127.0.0.1", number), timeout=5).close()
+    finally:
+        run.kill()
+        for process in frozen:
+            with suppress(ProcessLookupError):
+                os.kill(process, signal.SIGKILL)
+    assert frozen and "Traceback" not in errors
+    recording = th.Recording(path)
+    assert len(recording.poses) > 5 and (tmp_path / "trajectory.txt").is_file() and (tmp_path / "metrics.json").is_file()
+
+
+def descendants(parent: int) -> list[int]:
+    """The processes that were started by a process, and by those in turn."""
+    children = [int(word) for file in Path(f"/proc/{parent}/task").glob("*/children") for word in file.read_text().split()]
+    return children + [process for child in children for process in descendants(child)]

@@ -167,7 +167,7 @@ def test_ifc_and_gltf_hold_the_model(offices, tmp_path):
 def test_without_ifcopenshell_one_line_says_so(offices, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "ifcopenshell", None)
     with pytest.raises(LibraryError) as error:
-        write_ifc(tmp_path / "model.ifc", offices["cells"])
+        th.Building(offices["cells"]).to_ifc(tmp_path / "model.ifc")
     assert str(error.value) == "ifcopenshell: is not installed; install it with: pip install 'trihedron[ifc]'"
     assert not has_ifc() and list(tmp_path.iterdir()) == []
 
@@ -203,6 +203,42 @@ def test_rooms_and_distances_are_asked(walk, offices):
     with pytest.raises(TrihedronError) as error:
         plan.room_of("kitchen")
     assert str(error.value) == "room_of: is given str, no place; give a wall, an opening, a pose, a (4, 4) matrix or a point (3,)"
+
+
+def test_outlines_are_polygons(offices):
+    plan = th.Building(offices["manhattan_layout"])
+    for room in plan.rooms:
+        assert room.polygon.area == pytest.approx(room.area_m2.value, abs=1e-9)
+        assert np.array_equal(room.polygon.exterior.coords[:-1], room.corners)
+    for wall in plan.walls:
+        thickness = wall.thickness_m.value if np.isfinite(wall.thickness_m.value) else 0.06
+        assert wall.outline.area == pytest.approx(wall.length_m.value * thickness)
+    for opening in plan.openings:
+        assert plan.walls[opening.wall].outline.buffer(1e-9).covers(opening.outline)
+        assert opening.outline.centroid.coords[0] == pytest.approx(opening.middle[:2])
+
+
+def test_a_block_in_a_room_is_a_hole_of_its_polygon():
+    ring, block = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 3.0], [0.0, 3.0]]), np.array([[1.0, 1.0], [1.0, 2.0], [2.0, 2.0], [2.0, 1.0]])
+    exact = th.buildings.Measurement(0.0, 0.0)
+    room = th.buildings.Room(0, 0, ring, (block,), (), exact, exact, (), True)
+    assert room.polygon.area == pytest.approx(11.0) and len(room.polygon.interiors) == 1
+
+
+def test_each_file_is_written_alone(offices, tmp_path):
+    plan = th.Building(offices["manhattan_layout"])
+    plan.save(tmp_path / "all")
+    alone = {"building.json": plan.to_json, "floorplan.svg": plan.to_svg, "floorplan.dxf": plan.to_dxf}
+    alone |= {"building.glb": plan.to_glb, "model.ifc": plan.to_ifc}
+    for name, write in alone.items():
+        assert write(str(tmp_path / name)) == tmp_path / name
+    assert sorted(alone) == sorted(path.name for path in (tmp_path / "all").iterdir())
+    for name in ("building.json", "floorplan.svg", "building.glb"):
+        assert (tmp_path / name).read_bytes() == (tmp_path / "all" / name).read_bytes()
+    with pytest.raises(TrihedronError) as error:
+        plan.to_svg(tmp_path / "nowhere" / "plan.svg")
+    path = tmp_path / "nowhere" / "plan.svg"
+    assert str(error.value) == f"{path}: cannot be written: No such file or directory; give a path in a folder that exists"
 
 
 @pytest.mark.parametrize(
@@ -260,12 +296,14 @@ def test_a_preview_is_a_plan_of_some_views(walk, offices):
 @pytest.mark.slow
 def test_slam_gives_the_plan_so_far():
     room = Synthetic(length=4, width=160, height=120)
-    camera = room(0).camera
+    camera, plans = room(0).camera, []
     with th.Slam(camera, outputs=["trajectory", "building"]) as slam:
         for k in range(4):
             frame = room(k)
             slam.track(frame.color, frame.depth_m, 0.1 * (k + 1))
-        assert slam.building().storeys
+            plans.append(slam.building(max_age_s=0.25))
+        assert plans[0] is plans[1] is plans[2] is not plans[3] and plans[3].storeys
+        assert slam.building() is plans[3] is not slam.building(max_age_s=0.0)
     with th.Slam(camera, outputs=["trajectory"]) as slam, pytest.raises(TrihedronError) as error:
         slam.building()
     assert str(error.value) == 'outputs: has no building, so none is made; give outputs=["trajectory", "building"]'

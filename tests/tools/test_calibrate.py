@@ -1,6 +1,7 @@
 """`trihedron calibrate`: what it prints and writes, and that a run with its recommendation is better."""
 
 import json
+import re
 
 import cv2
 import numpy as np
@@ -109,6 +110,22 @@ def test_a_camera_that_is_right_is_left_alone(tmp_path, capsys):
     assert main(["calibrate", str(tmp_path), "--out", str(tmp_path / "camera.yaml")]) == 1
     cause = "is not of a data set with a camera file; copy the lines that are printed"
     assert capsys.readouterr().err == f"trihedron: {tmp_path / 'run.mcap'}: {cause}\n"
+
+
+@pytest.mark.slow
+def test_late_depth_is_recommended_for_the_data_set(tmp_path, capsys):
+    """Depth of three frames before: the run warns, the delay is recommended, and no camera file would mend it."""
+    room = Synthetic(frames="0:120")
+    write_tum(tmp_path / "room", 110, lambda k: room(k + 3), room)
+    run(tmp_path / "room", tmp_path / "before", "outputs=[trajectory]")
+    assert "depth was taken about 100 ms before colour: " in capsys.readouterr().err
+    assert main(["calibrate", str(tmp_path / "before")]) == 0
+    printed = capsys.readouterr().out
+    print(printed)
+    delay = re.search(
+        r"^recommended: add (-\d+\.\d) to dataset.depth_delay_ms \(dataset=tum, tamu and mcap\), or pair colour with the depth", printed, re.M
+    )
+    assert delay is not None and abs(float(delay[1]) + 100.0) < 15.0 and "no change recommended" not in printed
 
 
 @pytest.mark.slow
