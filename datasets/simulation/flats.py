@@ -13,7 +13,7 @@ import numpy as np
 from trihedron.datasets.simulation.buildings import DETAIL, DOORWAY_M, Building, lamps_at, rectangle, wall_with_gaps
 from trihedron.datasets.simulation.furniture import PIECES
 from trihedron.datasets.simulation.motion import Sway
-from trihedron.datasets.simulation.room import HEIGHT_M, UP, Room, Solid, Wall, box, shell, turned_box, walls_of
+from trihedron.datasets.simulation.room import HEIGHT_M, UP, Room, Solid, Wall, shell, turned_box, walls_of
 from trihedron.datasets.simulation.walks import Walk
 from trihedron.pipeline.core.linalg import norm
 from trihedron.pipeline.core.types import F64
@@ -177,7 +177,11 @@ def _tour(room: Rectangle, entry: F64) -> list[F64]:
     west, east, south, north = room
     if north - south < AISLE_M or east - west < AISLE_M:
         x, y = (west + east) / 2.0, (south + north) / 2.0
-        ends = [np.array([west + 0.9, y]), np.array([east - 0.9, y])] if east - west > north - south else [np.array([x, south + 0.9]), np.array([x, north - 0.9])]
+        ends = (
+            [np.array([west + 0.9, y]), np.array([east - 0.9, y])]
+            if east - west > north - south
+            else [np.array([x, south + 0.9]), np.array([x, north - 0.9])]
+        )
         return sorted(ends, key=lambda p: float(norm(p - entry)))
     x_in, y_in = min(1.25, 0.36 * (east - west)), min(1.25, 0.36 * (north - south))
     ring = [np.array(p) for p in rectangle((west + x_in, east - x_in), (south + y_in, north - y_in))]
@@ -216,7 +220,9 @@ WEIGHTS = {"wardrobe": 3, "tall_shelf": 1, "shelf": 2, "curtain": 1, "radiator":
 ON_WALLS = ("picture", "portrait", "picture", "portrait", "window")
 
 
-def _furniture(rng: np.random.Generator, room: Rectangle, doors: list[_Door], path: tuple[tuple[float, float], ...], walls: list[Solid]) -> list[Solid]:
+def _furniture(
+    rng: np.random.Generator, room: Rectangle, doors: list[_Door], path: tuple[tuple[float, float], ...], walls: list[Solid]
+) -> list[Solid]:
     """Furnish a room along its walls, clear of doors and path; what is free of the walls has pictures."""
     import shapely
 

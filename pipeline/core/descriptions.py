@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from trihedron.pipeline.core.plan_areas import area_sigma
 from trihedron.pipeline.core.table import Table
 from trihedron.pipeline.core.types import (
     OK,
@@ -203,7 +204,8 @@ def _(value: Surface) -> str:
 def summary_of_building(value: Building) -> str:
     """Return the numbers of elements, the area and the note of a plan."""
     counts = counted((len(value.storeys), "storey"), (len(value.areas_m2), "room"), (len(value.walls_m), "wall"), (len(value.spans_m), "opening"))
-    area = f" of {value.areas_m2.sum():.2f} ± {np.sqrt(value.area_variance.sum()):.2f} m²" if len(value.areas_m2) else ""
+    sigma = float(np.sqrt(sum(area_sigma(value, room) ** 2 for room in range(len(value.areas_m2)))))
+    area = f" of {value.areas_m2.sum():.2f} ± {sigma:.2f} m²" if len(value.areas_m2) else ""
     return f"{counts}{area}" + (f"; {value.note}" if value.note else "")
 
 

@@ -714,8 +714,11 @@ class Building(Value):
     `edge_sigma_m[j]` relative to the room (NaN = not seen); `closed` is True if every edge is on a wall.
     Of opening i: its wall, its (left, right) in metres from the wall's start, its (bottom, top) above the floor, the covariance of these four, a row
     of OPENING_KINDS, and the rooms it joins (-1 = none). `furniture` are ids of the planes of the map that are none of the building's own. Rows of
-    `support` are (row of ELEMENTS, the element, row of SUPPORTS, id or number). `note` names what is missing. `edits` are corrections by hand, with
-    names and uses of elements, as JSON; empty without any."""
+    `support` are (row of ELEMENTS, the element, row of SUPPORTS, id or number). `note` names what is missing. Rows of
+    `doubts` are (room, change, probability): by how much its area would change, m², if something is otherwise than the plan has it, beside what
+    `area_variance` says of its walls. `edits` are corrections by hand, with names and uses of elements, as JSON; empty without any."""
+
+    version: ClassVar[int] = 2
 
     T_world_building: Annotated[F64, Shape(4, 4), Rotations()]
     note: str
@@ -742,6 +745,7 @@ class Building(Value):
     opening_rooms: Annotated[I32, Shape("o", 2), IndexInto(".room_storeys", least=-1)]
     furniture: Annotated[I32, Shape("f")]
     support: Annotated[I32, Shape("n", 4)]
+    doubts: Annotated[F64, Shape("d", 3), Finite()]
     edits: str = ""
 
     @staticmethod
@@ -764,5 +768,5 @@ class Building(Value):
             number.copy(), np.empty((0, 3), np.int32), rows.copy(), number.copy(), none.copy(), none.copy(), none.copy(), np.empty(0, np.bool_),
             number.copy(),
             np.empty(0, np.uint8), rows.copy(), rows.copy(), np.empty((0, 4, 4)), np.empty((0, 2), np.int32), number.copy(),
-            np.empty((0, 4), np.int32),
+            np.empty((0, 4), np.int32), np.empty((0, 3)),
         )  # fmt: skip

@@ -46,6 +46,7 @@ ADDED_FIELDS: dict[tuple[str, int], dict[str, Any]] = {  # type and older versio
     },
     ("Pose", 4): {"keyframe_covariance": np.zeros((6, 6))},
     ("Map", 5): {"loop_closed": 0},
+    ("Building", 1): {"doubts": np.zeros((0, 3))},
 }
 # likewise -> the columns of keyframes that it lacks, each a copy of the column `covariance`, or zeros of this shape wherever that changes
 ADDED_COLUMNS: dict[tuple[str, int], dict[str, tuple[int, ...] | None]] = {

@@ -45,6 +45,7 @@ def assemble_building(state: BuildingState, evidence: Evidence, plans: list[Stor
     loops, corner_walls, variances, closed, room_storeys = [], [], [], [], []
     spans: list[list[float]] = []
     heights, kinds, opening_walls, opening_covariance, opening_rooms = [], [], [], [], []
+    doubts: list[tuple[int, float, float]] = []
     used: set[int] = set()
     for level, plan in enumerate(plans):
         first_wall, first_room = len(walls), len(areas)
@@ -70,6 +71,7 @@ def assemble_building(state: BuildingState, evidence: Evidence, plans: list[Stor
                 corners += [edge.begin for edge in loop]
                 edge_sigmas += [edge.sigma_m for edge in loop]
                 corner_walls += [first_wall + edge.wall if edge.wall >= 0 else -1 for edge in loop]
+            doubts += [(first_room + number, *doubt) for doubt in room.doubts]
             area, variance = _area(room)
             areas.append(area)
             variances.append(variance)
@@ -96,7 +98,7 @@ def assemble_building(state: BuildingState, evidence: Evidence, plans: list[Stor
         np.array(areas, np.float64), np.array(variances, np.float64), np.array(closed, np.bool_), np.array(opening_walls, np.int32),
         np.array(kinds, np.uint8), np.array(spans, np.float64).reshape(-1, 2), np.array(heights, np.float64).reshape(-1, 2),
         np.array(opening_covariance).reshape(-1, 4, 4), np.array(opening_rooms, np.int32).reshape(-1, 2), _furniture(map, used, plans, evidence),
-        np.array(support, np.int32).reshape(-1, 4),
+        np.array(support, np.int32).reshape(-1, 4), np.array(doubts, np.float64).reshape(-1, 3),
     )  # fmt: skip
 
 

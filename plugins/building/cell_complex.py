@@ -101,16 +101,16 @@ def _tall_share(parting: list[tuple[Face, Bool]], a: F64, b: F64) -> float:
 
 
 def inside_cells(cells: Cells) -> Bool:
-    """Return the cells (n,) that are inside: those that rays passed, and with them what was not seen and no wall parts from them. What is as thin as a
-    wall is solid where no ray passed."""
+    """Return the cells (n,) that are inside: those that rays passed, and with them what was not seen and no wall parts from them. What is as thin as
+    a wall is solid where no ray passed."""
     thin = np.array([polygon.buffer(-THIN_M / 2.0).is_empty for polygon in cells.polygons])
     return cut_cells(cells, OPEN_BORDER_M, np.where(thin, 1.0, UNSEEN))
 
 
 def cut_cells(cells: Cells, open_border_m: float, unseen: F64 | float) -> Bool:
-    """Label the cells (n,) inside or outside together, by a minimum cut source - cells - sink (Boykov, Jolly, ICCV 2001): a cell that is outside costs
-    the area that rays passed, m²; one that is inside costs `unseen` times the area that they did not; a metre of border between both without a wall
-    costs `open_border_m`."""
+    """Label the cells (n,) inside or outside together, by a minimum cut source - cells - sink (Boykov, Jolly, ICCV 2001): a cell that is outside
+    costs the area that rays passed, m²; one that is inside costs `unseen` times the area that they did not; a metre of border between both without a
+    wall costs `open_border_m`."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 

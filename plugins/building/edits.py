@@ -247,6 +247,8 @@ def _without(building: Building, keep: dict[str, Bool], numbers: dict[str, Any])
     corners = np.concatenate([np.arange(a, b) for _, a, b in loops] or [np.empty(0, int)]).astype(int)
     ends = np.cumsum([b - a for _, a, b in loops], dtype=np.int32).reshape(-1)
     unseen, support = building.unseen.copy(), building.support.copy()
+    doubts = building.doubts.copy()
+    doubts[:, 0] = _new_numbers(numbers["room"], doubts[:, 0])
     unseen[:, 0] = _new_numbers(numbers["wall"], unseen[:, 0])
     for element in keep:
         mine = support[:, 0] == ELEMENTS.index(element)
@@ -260,5 +262,5 @@ def _without(building: Building, keep: dict[str, Bool], numbers: dict[str, Any])
         closed=np.asarray(closed)[rooms], opening_walls=numbers["wall"][building.opening_walls[openings]],
         opening_kinds=building.opening_kinds[openings], spans_m=building.spans_m[openings], opening_heights_m=building.opening_heights_m[openings],
         opening_covariance=building.opening_covariance[openings], opening_rooms=numbers["room"][building.opening_rooms[openings]],
-        support=support[support[:, 1] >= 0],
+        support=support[support[:, 1] >= 0], doubts=doubts[doubts[:, 0] >= 0],
     )  # fmt: skip

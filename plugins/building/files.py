@@ -16,6 +16,7 @@ import numpy as np
 from trihedron.pipeline.core.descriptions import summary_of_building
 from trihedron.pipeline.core.files import new_file, write_file
 from trihedron.pipeline.core.linalg import norm
+from trihedron.pipeline.core.plan_areas import area_interval, area_sigma, seen_share
 from trihedron.pipeline.core.registry import register_files
 from trihedron.pipeline.core.types import ELEMENTS, F64, OPENING_KINDS, SUPPORTS, Building
 from trihedron.plugins.building.edits import missing_edits
@@ -125,7 +126,8 @@ def _room(building: Building, k: int) -> dict[str, Any]:
         "polygon": _numbers(building.corners_m[slice(*rings[0])]),
         "holes": [_numbers(building.corners_m[a:b]) for a, b in rings[1:]],
         "walls": [building.corner_walls[a:b].tolist() for a, b in rings], "area_m2": _numbers(building.areas_m2[k]),
-        "area_sigma_m2": _numbers(np.sqrt(building.area_variance[k])), "closed": bool(building.closed[k]), "support": _support(building, "room", k),
+        "area_sigma_m2": _numbers(area_sigma(building, k)), "area_interval_m2": _numbers(np.array(area_interval(building, k))),
+        "seen_share": _numbers(seen_share(building, k)), "closed": bool(building.closed[k]), "support": _support(building, "room", k),
     }  # fmt: skip
 
 
@@ -230,11 +232,14 @@ def _svg_opening(building: Building, opening: int, at: Any) -> list[str]:
 
 
 def area_text(building: Building, room: int) -> str:
-    """Return the area of a room, with its standard deviation where walls were seen all round."""
-    area, sigma = float(building.areas_m2[room]), float(np.sqrt(building.area_variance[room]))
-    return f"{area:.2f} ± {sigma:.2f} m²" if building.closed[room] else f"{area:.2f} m² seen"
+    """Return the area of a room: with its standard deviation where that tells all, else with its 95 % interval."""
+    area, sigma, (low, high) = float(building.areas_m2[room]), area_sigma(building, room), area_interval(building, room)
+    if abs(low + high - 2.0 * area) < LOPSIDED * (high - low):
+        return f"{area:.2f} ± {sigma:.2f} m²"
+    return f"{area:.2f} m² ({low:.1f} to {high:.1f})"
 
 
+LOPSIDED = 0.2  # of an interval, by which its middle is off the area, from which a plan has both ends
 LONGEST_UNLABELLED_M = 0.8
 ALONG = (0.5, 0.35, 0.65, 0.2, 0.8)  # shares of an edge where its length is written, the first that is free
 LETTERS_PX = {"name": 8.5, "area": 7.4, "length": 6.0, "small": 5.2}  # about the width of a letter

@@ -20,8 +20,8 @@ BESIDE_M = 1.0  # on stairs
 
 @dataclass(frozen=True)
 class FreeSpace:
-    """The levels that rays passed, a bit each, in cells (h, w) of CELL_M from `origin` (2,), where the floor was seen (h, w), and where furniture stands
-    that rays do not pass (h, w)."""
+    """The levels that rays passed, a bit each, in cells (h, w) of CELL_M from `origin` (2,), where the floor was seen (h, w), and where furniture
+    stands that rays do not pass (h, w)."""
 
     origin: F64
     levels: U32

@@ -15,6 +15,7 @@ import numpy as np
 from trihedron.pipeline.core.files import new_file
 from trihedron.pipeline.core.libraries import imports_of
 from trihedron.pipeline.core.linalg import norm
+from trihedron.pipeline.core.plan_areas import area_interval, area_sigma, seen_share
 from trihedron.pipeline.core.types import F64, Building
 from trihedron.plugins.building.geometry import SHEET_M, rings_of, rooms_on, storey_levels
 from trihedron.plugins.building.labels import label_of, use_of
@@ -131,10 +132,18 @@ class _IfcWriter:
         self._aggregate(space, storey)
         self._place(space, np.array([0.0, 0.0, low]), np.array([1.0, 0.0]))
         self._solid(space, rings_of(self.building, room), high - low)
-        area, sigma = float(self.building.areas_m2[room]), float(np.sqrt(self.building.area_variance[room]))
+        area, sigma = float(self.building.areas_m2[room]), area_sigma(self.building, room)
         quantities = self.api.pset.add_qto(self.file, product=space, name="Qto_SpaceBaseQuantities")
         self.api.pset.edit_qto(self.file, qto=quantities, properties={"NetFloorArea": area, "Height": high - low})
-        self._properties(space, AreaSigma=sigma, SeenAllRound=bool(self.building.closed[room]))
+        low_m2, high_m2 = area_interval(self.building, room)
+        self._properties(
+            space,
+            AreaSigma=sigma,
+            AreaLow=low_m2,
+            AreaHigh=high_m2,
+            SeenShare=seen_share(self.building, room),
+            SeenAllRound=bool(self.building.closed[room]),
+        )
 
     def _slab(self, room: int, storey: Any, k: int, kind: str, height: float) -> None:
         """Make the slab below a room's floor, or above its ceiling."""

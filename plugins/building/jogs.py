@@ -41,8 +41,8 @@ def jog_sides(faces: list[Face], evidence: Evidence) -> list[Face]:
 
 
 def parting_columns(face: Face, faces: list[Face]) -> Bool:
-    """Return the columns (k,) of a face that part rooms: the tall ones, and gaps between them as wide as a door unless a face close behind shows that they
-    are niches."""
+    """Return the columns (k,) of a face that part rooms: the tall ones, and gaps between them as wide as a door unless a face close behind shows that
+    they are niches."""
     out = face.tall.copy()
     for (_, a), (b, _) in pairwise(runs_of(face.tall)):
         niche = any(_is_read_beyond(face, other, a, True) or _is_read_beyond(face, other, b, False) for other in faces)
@@ -65,9 +65,9 @@ def is_recess(wall: Face, begin_m: float, end_m: float, faces: list[Face]) -> bo
     """Say if a face is read close behind most of a stretch of a wall: what is open there is a niche."""
     places = np.arange(begin_m + CELL_M / 2.0, end_m, CELL_M)
     for face in faces:
-        if float(matmul(face.normal, wall.normal)) > 0.999 and DEPTH_M[0] < wall.offset_m - face.offset_m < DEPTH_M[1]:
-            if (levels_read(face, places) > 0).mean() > 0.5:
-                return True
+        behind = float(matmul(face.normal, wall.normal)) > 0.999 and DEPTH_M[0] < wall.offset_m - face.offset_m < DEPTH_M[1]
+        if behind and (levels_read(face, places) > 0).mean() > 0.5:
+            return True
     return False
 
 

@@ -10,14 +10,12 @@ from trihedron.pipeline.core.types import F32, F64, I32
 
 
 @kernel
-def looks_kernel(
-    depth: F32, camera: F64, T: F64, line: F64, normal: F64, heights: F64, nearest_m: float, margin: F64, on: I32, beyond: I32
-) -> None:
+def looks_kernel(depth: F32, camera: F64, T: F64, line: F64, normal: F64, heights: F64, nearest_m: float, margin: F64, on: I32, beyond: I32) -> None:
     """Add to `on` and `beyond` (k, levels) one where a view reads a vertical plane at a column and a height, or what is behind it.
 
-    `line` (k, 2) are the columns' places on the plan, `normal` (2,) the plane's, towards the side it is seen from, `heights` (levels,) the levels', T is
-    `T_camera_building`. Views nearer to the plane than `nearest_m` and columns not in a view add nothing. A reading z m away is on the plane within
-    `margin[0] + margin[1] z²`, at most `margin[2]`, of it along the normal, and behind it from `margin[3]` more."""
+    `line` (k, 2) are the columns' places on the plan, `normal` (2,) the plane's, towards the side it is seen from, `heights` (levels,) the levels';
+    T is `T_camera_building`. Views nearer to the plane than `nearest_m` and columns not in a view add nothing. A reading z m away is on the plane
+    within `margin[0] + margin[1] z²`, at most `margin[2]`, of it along the normal, and behind it from `margin[3]` more."""
     h, w = depth.shape
     eye_x = -(T[0, 0] * T[0, 3] + T[1, 0] * T[1, 3] + T[2, 0] * T[2, 3])
     eye_y = -(T[0, 1] * T[0, 3] + T[1, 1] * T[1, 3] + T[2, 1] * T[2, 3])

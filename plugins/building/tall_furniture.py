@@ -1,4 +1,4 @@
-"""Tall furniture, told from walls: how probable it is that a stretch of a face is one, by the heights at which views read it and what is behind it."""
+"""Tall furniture, told from walls: the probability that a stretch of a face is a wall, by the heights at which views read it and what is behind."""
 
 from __future__ import annotations
 
@@ -60,8 +60,8 @@ class _Stretch:
 def remove_furniture(
     faces: list[Face], evidence: Evidence, storey: Storey, space: FreeSpace, least_m: float
 ) -> tuple[list[Face], list[Doubt]]:  # fmt: skip
-    """Return the faces without the stretches that are rather furniture than walls, what stands behind which is marked in `space`, and what is in doubt
-    among both; a face of which less than `least_m` is left is none unless it reaches higher than furniture."""
+    """Return the faces without the stretches that are rather furniture than walls, and how certain that is of each stretch. What stands behind those
+    removed is marked in `space`; a face of which less than `least_m` is left is none unless it reaches higher than furniture."""
     highest = min(FURNITURE_M[1], storey.ceiling_m - storey.bottom_m - BELOW_CEILING_M) if np.isfinite(storey.ceiling_m) else FURNITURE_M[1]
     stretches = [_stretches(face, evidence, storey) for face in faces]
     faces = [_with_known(face, found, highest, faces) for face, found in zip(faces, stretches)]

@@ -15,6 +15,7 @@ from trihedron.pipeline.core import types
 from trihedron.pipeline.core.described import Described
 from trihedron.pipeline.core.errors import DataError, UsageError
 from trihedron.pipeline.core.linalg import matmul, norm
+from trihedron.pipeline.core.plan_areas import area_interval, area_sigma, seen_share
 from trihedron.pipeline.core.types import F64, OPENING_KINDS, Pose
 from trihedron.plugins.building.geometry import quad, rings_of
 from trihedron.plugins.building.labels import name_of, use_of
@@ -96,7 +97,8 @@ class Edge(Described):
 @dataclass(frozen=True)
 class Room(Described):
     """A room: corners (n, 2) anticlockwise, those of holes the other way, the edges of all, area (m²) and perimeter (m) of the outer ring, the
-    numbers of its openings; `closed` if a wall was seen all round."""
+    numbers of its openings; `closed` if a wall was seen all round. `area_interval_m2` is the 95 % interval of the area, with what may be otherwise
+    than the plan has it (furniture or a wall, what no view shows); `seen_share` the share of the outline that was read, 0 to 1."""
 
     number: int
     storey: int
@@ -109,6 +111,8 @@ class Room(Described):
     closed: bool
     name: str = ""
     use: str = ""
+    area_interval_m2: tuple[float, float] = (0.0, 0.0)
+    seen_share: float = 1.0
 
     @cached_property
     def polygon(self) -> shapely.Polygon:
@@ -388,11 +392,12 @@ class Building:
         outer, *holes = rings_of(self.plan, k)
         edges = [edge for of, a, b in self.plan.loops if of == k for edge in self._edges(int(a), int(b))]
         first, stop = next((int(a), int(b)) for of, a, b in self.plan.loops if of == k)
-        area = Measurement(float(self.plan.areas_m2[k]), float(np.sqrt(self.plan.area_variance[k])))
+        area = Measurement(float(self.plan.areas_m2[k]), area_sigma(self.plan, k))
         openings = tuple(int(o) for o in np.nonzero((self.plan.opening_rooms == k).any(axis=1))[0])
         return Room(
             k, int(self.plan.room_storeys[k]), outer, tuple(holes), tuple(edges), area, self._perimeter(first, stop), openings,
-            bool(self.plan.closed[k]), name_of(self.plan, "room", k), use_of(self.plan, k),
+            bool(self.plan.closed[k]), name_of(self.plan, "room", k), use_of(self.plan, k), area_interval(self.plan, k),
+            seen_share(self.plan, k),
         )  # fmt: skip
 
     def _edges(self, a: int, b: int) -> list[Edge]:

@@ -4,8 +4,8 @@ Each scene is tracked with several seeds (of textures, path and noise) and the d
 aligns trajectory.txt with the truth, never by itself. A room is found where the intersection over union with a true one is above 0.5. Walls are the
 edges of found rooms that lie on a face that was seen, position the distance of their middle from the true edge. A doorway is found within 0.3 m of
 its middle. "honest" is the share of errors of areas, wall offsets and storey heights within 1.96 of their standard deviations. Figures are medians
-over the seeds, "honest" a mean. slanted_flat is laid out by atlanta_layout; the seed of random_flat is the number of the flat, too. A second table has
-the measure of methods that are judged on Structured3D: rooms, corners and angles, means over the runs with 95 % intervals (Student's t). A benchmark
+over the seeds, "honest" a mean. slanted_flat is laid out by atlanta_layout; the seed of random_flat is the number of the flat, too. A second table
+has the measure of methods that are judged on Structured3D: rooms, corners and angles, means over the runs with 95 % intervals (Student's t). A benchmark
 with --out that was stopped goes on where it was.
 
 Example: trihedron benchmark building --scenes offices --seeds 2
@@ -42,9 +42,7 @@ PUBLISHED_HEADER = ["scene", "sensor", "runs", "room P", "room R", "room F1", "c
 def main(argv: list[str]) -> int:
     """Print the table; returns the exit code. Raises UsageError for an unknown scene or plugin, DataError for a run without a plan."""
     parser = Parser("benchmark building", __name__)
-    parser.add_argument(
-        "--scenes", default=",".join(SCENES), metavar="A,B", help=f"some of them, or {FURNISHED} (default: {','.join(SCENES)})"
-    )
+    parser.add_argument("--scenes", default=",".join(SCENES), metavar="A,B", help=f"some of them, or {FURNISHED} (default: {','.join(SCENES)})")
     parser.add_argument("--seeds", type=int, default=5, metavar="N", help="runs of each scene (default: 5)")
     parser.add_argument("--first-seed", type=int, default=0, metavar="N", help="seed of the first (default: 0)")
     parser.add_argument("--sensors", default=",".join(SENSORS), metavar="A,B", help=f"of the depth noise (default: {','.join(SENSORS)})")

@@ -10,6 +10,7 @@ import numpy as np
 
 from trihedron.comparison.floorplan_scores import Score, floorplan_scores
 from trihedron.pipeline.core.errors import DataError
+from trihedron.pipeline.core.plan_areas import area_interval
 
 if TYPE_CHECKING:
     from trihedron.datasets.simulation.true_plan import TruePlan
@@ -59,7 +60,8 @@ def plan_errors(building: Building, T_truth_world: F64, plans: list[TruePlan]) -
     found = [_doors(building, plan, T, building.wall_storeys[building.opening_walls] == storey) for storey, plan in _storey_plan_pairs(at, plans)]
     scores = _scores(building, mine, at, truth)
     doors, false, doorways = sum(hits for hits, _ in found), sum(wrong for _, wrong in found), sum(len(plan.doorways) for plan in plans)
-    honest = [abs(error) < 1.96 * np.sqrt(building.area_variance[a]) for error, (a, _) in zip(areas, pairs)]
+    within = [low <= building.areas_m2[a] - error <= high for error, (a, _) in zip(areas, pairs) for low, high in [area_interval(building, a)]]
+    honest = list(within)
     honest += [abs(off) < 1.96 * sigma for off, _, sigma in walls if np.isfinite(sigma)]
     honest += [abs(error) < 1.96 * sigma for error, sigma in heights]
     return {
@@ -74,6 +76,7 @@ def plan_errors(building: Building, T_truth_world: F64, plans: list[TruePlan]) -
         "door_recall": doors / doorways if doorways else float("nan"),
         "door_precision": doors / (doors + false) if doors + false else float("nan"),
         "area_error": _median([abs(error) / truth[b][2].area for error, (_, b) in zip(areas, pairs)]),
+        "area_within": float(np.mean(within)) if within else float("nan"),
         "height_m": _median([abs(error) for error, _ in heights]),
         "honest": float(np.mean(honest)) if honest else float("nan"),
     }

@@ -66,7 +66,9 @@ def floorplan_scores(found: list[Any], true: list[Any]) -> dict[str, Score]:
 
 def _matches(found: list[Any], true: list[Any]) -> list[tuple[int, int]]:
     """Match found rooms that overlap no other with true ones, the best first."""
-    alone = [k for k, room in enumerate(found) if all(room.intersection(other).area <= OVERLAP * room.area for i, other in enumerate(found) if i != k)]
+    alone = [
+        k for k, room in enumerate(found) if all(room.intersection(other).area <= OVERLAP * room.area for i, other in enumerate(found) if i != k)
+    ]
     overlap = [(found[k].intersection(room).area / found[k].union(room).area, k, j) for k in alone for j, room in enumerate(true)]
     return _one_to_one(sorted((item for item in overlap if item[0] >= ROOM_IOU), reverse=True))
 

@@ -1,0 +1,70 @@
+"""Areas of the rooms of a building with what is not certain of them: where their walls are, and what may be otherwise than the plan has it."""
+
+from __future__ import annotations
+
+from itertools import product
+from math import erf, sqrt
+
+import numpy as np
+
+from trihedron.pipeline.core.linalg import matmul, norm
+from trihedron.pipeline.core.types import F64, Building
+
+TAIL = 0.025  # of a 95 % interval, on each side
+MOST = 8  # doubts of a room that are combined; what the others would change is added to the variance
+STEPS = 60  # of the bisection
+
+
+def area_sigma(building: Building, room: int) -> float:
+    """Return the standard deviation of the area of a room, m²."""
+    doubts = _doubts(building, room)
+    return float(np.sqrt(building.area_variance[room] + (doubts[:, 0] ** 2 * doubts[:, 1] * (1.0 - doubts[:, 1])).sum()))
+
+
+def area_interval(building: Building, room: int) -> tuple[float, float]:
+    """Return the 95 % interval of the area of a room, m²: of the mixture of normal distributions in which each doubt is true or not."""
+    doubts, area = _doubts(building, room), float(building.areas_m2[room])
+    doubts = doubts[np.argsort(-(doubts[:, 0] ** 2) * doubts[:, 1] * (1.0 - doubts[:, 1]), kind="stable")]
+    rest = doubts[MOST:]
+    sigma = sqrt(max(float(building.area_variance[room] + (rest[:, 0] ** 2 * rest[:, 1] * (1.0 - rest[:, 1])).sum()), 1e-12))
+    weights, shifts = [], []
+    for chosen in product((False, True), repeat=min(len(doubts), MOST)):
+        weights.append(float(np.prod([p if true else 1.0 - p for true, (_, p) in zip(chosen, doubts)])))
+        shifts.append(float(sum(change for true, (change, _) in zip(chosen, doubts) if true)))
+    low, high = (_quantile(np.array(weights), np.array(shifts), sigma, share) for share in (TAIL, 1.0 - TAIL))
+    return max(area + low, 0.0), area + high
+
+
+def seen_share(building: Building, room: int) -> float:
+    """Return the share of a room's outline that readings show, 0 to 1; openings count as seen."""
+    total = unseen = 0.0
+    for of, a, b in building.loops:
+        corners = building.corners_m[a:b]
+        for p, q, wall in zip(corners, np.roll(corners, -1, axis=0), building.corner_walls[a:b]) if of == room else ():
+            length = float(norm(q - p))
+            total += length
+            unseen += length if wall < 0 else min(_unseen_m(building, int(wall), p, q), length)
+    return 1.0 - unseen / total if total else 0.0
+
+
+def _doubts(building: Building, room: int) -> F64:
+    """Return change and probability (n, 2) of the doubts about a room."""
+    return np.asarray(building.doubts[building.doubts[:, 0] == room, 1:], np.float64)
+
+
+def _quantile(weights: F64, shifts: F64, sigma: float, share: float) -> float:
+    """Return the quantile of a mixture of normal distributions of one standard deviation, by bisection."""
+    low, high = float(shifts.min()) - 6.0 * sigma, float(shifts.max()) + 6.0 * sigma
+    for _ in range(STEPS):
+        middle = 0.5 * (low + high)
+        below = sum(w * 0.5 * (1.0 + erf((middle - shift) / (sigma * sqrt(2.0)))) for w, shift in zip(weights, shifts))
+        low, high = (middle, high) if below < share else (low, middle)
+    return 0.5 * (low + high)
+
+
+def _unseen_m(building: Building, wall: int, p: F64, q: F64) -> float:
+    """Return the length of the stretch p to q of a wall without a reading, m."""
+    start, end = building.walls_m[wall]
+    along = (end - start) / max(float(norm(end - start)), 1e-9)
+    a, b = sorted((float(matmul(p - start, along)), float(matmul(q - start, along))))
+    return float(sum(max(min(b, stop) - max(a, begin), 0.0) for of, begin, stop in building.unseen if int(of) == wall))
