@@ -15,7 +15,7 @@ from trihedron.datasets.simulation.furniture import PIECES
 from trihedron.datasets.simulation.motion import Sway
 from trihedron.datasets.simulation.room import HEIGHT_M, UP, Room, Solid, Wall, shell, turned_box, walls_of
 from trihedron.datasets.simulation.walks import Walk
-from trihedron.pipeline.core.linalg import norm
+from trihedron.pipeline.core.linalg import matmul, norm
 from trihedron.pipeline.core.types import F64
 
 JAMB_M = 0.35  # least distance of a door from the end of its wall
@@ -194,7 +194,7 @@ def _free(solid: Solid, path: Any, taken: list[Any]) -> bool:
     import shapely
 
     corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * solid.half[:2]
-    outline = shapely.Polygon(corners @ solid.R_world_solid[:2, :2].T + solid.centre[:2])
+    outline = shapely.Polygon(matmul(corners, solid.R_world_solid[:2, :2].T) + solid.centre[:2])
     if outline.distance(path) < CLEAR_M or any(outline.distance(other) < 0.05 for other in taken):
         return False
     taken.append(outline)
@@ -251,7 +251,7 @@ def _furniture(
 
 def _bounds(solids: list[Solid]) -> tuple[float, float, float, float]:
     """Return west, south, east and north of solids that are square to the axes."""
-    half = np.array([np.abs(solid.R_world_solid[:2, :2]) @ solid.half[:2] for solid in solids])
+    half = np.array([matmul(np.abs(solid.R_world_solid[:2, :2]), solid.half[:2]) for solid in solids])
     centre = np.array([solid.centre[:2] for solid in solids])
     low, high = (centre - half).min(axis=0), (centre + half).max(axis=0)
     return float(low[0]), float(low[1]), float(high[0]), float(high[1])

@@ -64,7 +64,6 @@ class Synthetic:
 
     frames: Frames = ""  # part to make, half open: A:B, A:, :B, every S-th A:B:S; empty = all
     scene: Scene = Scene.room  # room | corridor | offices | rooms | flat | slanted_flat | house | random_flat
-    flat: NonNegativeInt = 0  # number of a random_flat
     length: NonNegativeInt = 0  # frames; 0 = the scene's own: 150 of the room, once round a building (a longer walk goes on)
     fps: PositiveFloat = 30.0
     seed: NonNegativeInt = 0  # of textures, path and noise
@@ -76,6 +75,7 @@ class Synthetic:
     motion: Motion = Motion.walk  # walk | fast | still | pan; in a building only walk
     slanted: bool = False  # turns two of the room's walls by about 10°
     curved: bool = False  # adds a column, a ball and a plant to the room
+    flat: NonNegativeInt = 0  # number of a random_flat
 
     def __post_init__(self) -> None:
         if self.scene is not Scene.room and self.motion is not Motion.walk:

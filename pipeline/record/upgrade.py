@@ -160,7 +160,7 @@ def _rename_fields(data: bytes) -> bytes:
     """A message with the names, fields and columns of today."""
     message = LegacyMessage.FromString(data)
     if not message.arrays:
-        return _add_tables(message, data)
+        return _add_to_message(message, data)
     message.type = RENAMED_TYPES.get(message.type, message.type)
     fields, older = RENAMED_FIELDS.get(message.type, {}), (message.type, message.version)
     added = older in ADDED_FIELDS or older in ADDED_COLUMNS or older in ADDED_TABLES
@@ -185,18 +185,30 @@ def _rename_fields(data: bytes) -> bytes:
     return _rename_fields(bytes(message.SerializeToString()))  # which may be an older version still
 
 
-def _add_tables(header: Any, data: bytes) -> bytes:
-    """A message of a schema of its own with the empty tables that its version lacks."""
+def _add_to_message(header: Any, data: bytes) -> bytes:
+    """A message of a schema of its own with the fields and empty tables that its version lacks."""
     older = header.type, header.version
-    if older not in ADDED_TABLES:
+    if older not in ADDED_TABLES and older not in ADDED_FIELDS:
         return data
     with suppress(DecodeError):  # a damaged message, of which the decoder will say so
         message = message_class(header.type).FromString(data)
         message.version += 1
-        for name, columns in ADDED_TABLES[older].items():
+        for name, columns in ADDED_TABLES.get(older, {}).items():
             getattr(message, name).layout = _empty_layout(columns)
+        for name, value in ADDED_FIELDS.get(older, {}).items():
+            _set_field(message, name, value)
         return bytes(message.SerializeToString())
     return data
+
+
+def _set_field(message: Any, name: str, value: Any) -> None:
+    """Set a number, or an array as the codec writes it."""
+    if np.ndim(value) == 0:
+        setattr(message, name, value)
+        return
+    found = getattr(message, name)
+    found.dtype, found.encoding, found.data = value.dtype.str.lstrip("<"), "raw", value.tobytes()
+    found.shape.extend(value.shape)
 
 
 def _empty_layout(columns: Columns) -> str:

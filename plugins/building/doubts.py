@@ -1,4 +1,4 @@
-"""What is not certain of a room's area besides where its walls are: what may be furniture or a wall, and what no view shows."""
+"""Doubts about the area of a room, besides where its walls are: what may be furniture or a wall, and what no view shows."""
 
 from __future__ import annotations
 

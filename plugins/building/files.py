@@ -232,11 +232,12 @@ def _svg_opening(building: Building, opening: int, at: Any) -> list[str]:
 
 
 def area_text(building: Building, room: int) -> str:
-    """Return the area of a room: with its standard deviation where that tells all, else with its 95 % interval."""
+    """Return the area of a room: with its standard deviation where that tells all, else with its 95 % interval; "seen" where its walls were not seen
+    all round."""
     area, sigma, (low, high) = float(building.areas_m2[room]), area_sigma(building, room), area_interval(building, room)
-    if abs(low + high - 2.0 * area) < LOPSIDED * (high - low):
+    if building.closed[room] and abs(low + high - 2.0 * area) < LOPSIDED * (high - low):
         return f"{area:.2f} ± {sigma:.2f} m²"
-    return f"{area:.2f} m² ({low:.1f} to {high:.1f})"
+    return f"{area:.2f} m²{'' if building.closed[room] else ' seen'} ({low:.1f} to {high:.1f})"
 
 
 LOPSIDED = 0.2  # of an interval, by which its middle is off the area, from which a plan has both ends

@@ -38,7 +38,7 @@ class FreeSpace:
     def within(self, points: F64) -> Bool:
         """Say of points (n, 2) if rays passed there or furniture stands there."""
         row, column, inside = self._cells(points)
-        out = self.at(points) != 0
+        out: Bool = np.asarray(self.at(points) != 0, np.bool_)
         out[inside] |= self.furniture[row[inside], column[inside]]
         return out
 

@@ -57,13 +57,13 @@ def _is_read_beyond(front: Face, other: Face, column: int, at_end: bool) -> bool
         return False
     end, width = front.start_m + CELL_M * column, round(BESIDE_M / CELL_M)
     beyond = end + CELL_M * (np.arange(width) + 1.5) * (1.0 if at_end else -1.0)
-    ahead, behind = levels_read(front, beyond), levels_read(other, beyond)
+    ahead, behind = (levels_read(face, np.asarray(beyond, np.float64)) for face in (front, other))
     return bool(ahead.sum() < MOSTLY_BEHIND * behind.sum() and (behind > 0).mean() > 0.5)
 
 
 def is_recess(wall: Face, begin_m: float, end_m: float, faces: list[Face]) -> bool:
     """Say if a face is read close behind most of a stretch of a wall: what is open there is a niche."""
-    places = np.arange(begin_m + CELL_M / 2.0, end_m, CELL_M)
+    places = np.asarray(np.arange(begin_m + CELL_M / 2.0, end_m, CELL_M), np.float64)
     for face in faces:
         behind = float(matmul(face.normal, wall.normal)) > 0.999 and DEPTH_M[0] < wall.offset_m - face.offset_m < DEPTH_M[1]
         if behind and (levels_read(face, places) > 0).mean() > 0.5:
@@ -102,4 +102,4 @@ def _is_same(side: Face, other: Face) -> bool:
     if float(matmul(side.normal, other.normal)) < 0.999 or abs(side.offset_m - other.offset_m) > SAME_SIDE_M:
         return False
     begin, end = side.start_m, side.start_m + CELL_M * len(side.count)
-    return other.share(begin, end, other.count.any(axis=1)) > 0.5
+    return other.share(begin, end, np.asarray(other.count.any(axis=1), np.bool_)) > 0.5

@@ -31,7 +31,7 @@ def looks_at(face: Face, evidence: Evidence, storey: Storey) -> Looks:
     """Count the looks of all views at a face."""
     columns = len(face.count)
     line = (face.start_m + (np.arange(columns) + 0.5) * CELL_M)[:, None] * face.along + face.offset_m * face.normal
-    heights: F64 = storey.bottom_m + (np.arange(LEVELS) + 0.5) * LEVEL_M
+    heights = np.asarray(storey.bottom_m + (np.arange(LEVELS) + 0.5) * LEVEL_M, np.float64)
     on, beyond = np.zeros((columns, LEVELS), np.int32), np.zeros((columns, LEVELS), np.int32)
     for view, T in zip(evidence.views, evidence.poses):
         looks_kernel(view.depth_m, view.camera.intrinsics, inv(T), line, face.normal, heights, NEAREST_M, MARGIN, on, beyond)

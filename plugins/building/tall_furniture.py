@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from trihedron.pipeline.core.linalg import matmul
+from trihedron.pipeline.core.linalg import matmul, norm
 from trihedron.pipeline.core.types import F64
 from trihedron.plugins.building.evidence import Evidence
 from trihedron.plugins.building.faces import Face, longest_run, runs_of
@@ -44,11 +44,11 @@ class Doubt:
     @property
     def area_m2(self) -> float:
         """Return the area between the stretch and the wall behind it."""
-        return float(np.linalg.norm(self.ends[1] - self.ends[0])) * self.depth_m
+        return float(norm(self.ends[1] - self.ends[0])) * self.depth_m
 
 
 @dataclass(frozen=True)
-class _Stretch:
+class Stretch:
     """Columns `begin` to `end` of a face, the height up to which they were read and if views looked over them."""
 
     begin: int
@@ -70,7 +70,7 @@ def remove_furniture(
         tall, high = face.tall.copy(), False
         for one in found:
             depth = _depth_to_wall(face, one, faces)
-            probability = _probability(one, highest, _prior(face, one, faces, depth))
+            probability = wall_probability(one, highest, _prior(face, one, faces, depth))
             if depth is not None and depth < THIN_M and _wall_on_both_sides(face, one, depth, faces):
                 probability = 0.0
             deep = USUAL_DEPTH_M if depth is None else depth
@@ -85,7 +85,7 @@ def remove_furniture(
     return kept, [doubt for doubt in doubts if 0.0 < doubt.wall_probability < 1.0]
 
 
-def _stretches(face: Face, evidence: Evidence, storey: Storey) -> list[_Stretch]:
+def _stretches(face: Face, evidence: Evidence, storey: Storey) -> list[Stretch]:
     """Compare the heights at which views read the stretches of a face with those at which they read what is behind its line."""
     looks, level = looks_at(face, evidence, storey), np.arange(LEVELS)
     below = (level + 1.0) * LEVEL_M < (storey.ceiling_m - storey.bottom_m if np.isfinite(storey.ceiling_m) else LEVELS * LEVEL_M)
@@ -95,52 +95,52 @@ def _stretches(face: Face, evidence: Evidence, storey: Storey) -> list[_Stretch]
     found = []
     for a, b in runs_of(face.tall):
         share = LEAST_SHARE if (b - a) * CELL_M >= LONG_M else 0.5
-        found.append(_Stretch(a, b, float(np.quantile(top[a:b], 1.0 - share)) * LEVEL_M, bool(over[a:b].mean() >= LEAST_SHARE)))
+        found.append(Stretch(a, b, float(np.quantile(top[a:b], 1.0 - share)) * LEVEL_M, bool(over[a:b].mean() >= LEAST_SHARE)))
     return found
 
 
-def _probability(one: _Stretch, highest: float, prior: float) -> float:
+def wall_probability(one: Stretch, highest: float, prior: float) -> float:
     """Return the probability that a stretch is a wall: furniture would have to be as high as it was read, and nobody looks over a wall."""
     as_high = float(np.clip((highest - one.height_m) / (highest - FURNITURE_M[0]), 0.0, 1.0))
     wall, furniture = prior * (MISTAKEN if one.over else 1.0), (1.0 - prior) * as_high
     return wall / (wall + furniture) if wall + furniture > 0.0 else 0.0
 
 
-def _prior(face: Face, one: _Stretch, faces: list[Face], depth: float | None) -> float:
+def _prior(face: Face, one: Stretch, faces: list[Face], depth: float | None) -> float:
     """Return the probability of a wall where its other face is close behind or it continues one, where a wall is seen behind, and elsewhere."""
     if _is_backed(face, one, faces) or _continues(face, one):
         return PRIORS["backed"]
     return PRIORS["alone" if depth is None else "behind"]
 
 
-def _with_known(face: Face, found: list[_Stretch], highest: float, faces: list[Face]) -> Face:
+def _with_known(face: Face, found: list[Stretch], highest: float, faces: list[Face]) -> Face:
     """Mark the stretches of a face that are walls for certain, first those by their height, then those that continue one or have another face."""
     known = np.zeros(len(face.tall), np.bool_)
     for one in found:
-        known[one.begin : one.end] = _probability(one, highest, 0.5) >= KNOWN
+        known[one.begin : one.end] = wall_probability(one, highest, 0.5) >= KNOWN
     face = replace(face, known=known)
     more = known.copy()
     for one in found:
         long = (one.end - one.begin) * CELL_M >= LONG_M
         if long and (_is_backed(face, one, faces) or _continues(face, one)):
-            more[one.begin : one.end] |= _probability(one, highest, PRIORS["backed"]) >= KNOWN
+            more[one.begin : one.end] |= wall_probability(one, highest, PRIORS["backed"]) >= KNOWN
     return replace(face, known=more)
 
 
-def _footprint(face: Face, one: _Stretch, depth: float) -> F64:
+def _footprint(face: Face, one: Stretch, depth: float) -> F64:
     """Return points (n, 2) denser than cells behind a stretch of a face."""
     along = face.start_m + CELL_M * (np.arange(2 * one.begin, 2 * one.end) + 0.5) / 2.0
     away = face.offset_m - CELL_M / 2.0 * np.arange(int(2.0 * depth / CELL_M) + 1)
     return np.asarray((along[:, None, None] * face.along + away[None, :, None] * face.normal).reshape(-1, 2))
 
 
-def _continues(face: Face, one: _Stretch) -> bool:
+def _continues(face: Face, one: Stretch) -> bool:
     """Say if there is more beside a stretch, on its line, that is a wall for certain."""
     aside = round(ASIDE_M / CELL_M)
     return bool(face.known[max(one.begin - aside, 0) : one.begin].any() or face.known[one.end : one.end + aside].any())
 
 
-def _is_backed(face: Face, one: _Stretch, faces: list[Face]) -> bool:
+def _is_backed(face: Face, one: Stretch, faces: list[Face]) -> bool:
     """Say if another face looks away from a stretch, a wall's thickness behind it."""
     begin, end = face.start_m + CELL_M * one.begin, face.start_m + CELL_M * one.end
     return any(
@@ -151,7 +151,7 @@ def _is_backed(face: Face, one: _Stretch, faces: list[Face]) -> bool:
     )
 
 
-def _depth_to_wall(face: Face, one: _Stretch, faces: list[Face]) -> float | None:
+def _depth_to_wall(face: Face, one: Stretch, faces: list[Face]) -> float | None:
     """Return how far behind the line of a stretch a strip of a wall is seen, beside or above it; None where none is."""
     begin, end, found = face.start_m + CELL_M * one.begin - BESIDE_M, face.start_m + CELL_M * one.end + BESIDE_M, list[float]()
     for other in faces:
@@ -164,7 +164,7 @@ def _depth_to_wall(face: Face, one: _Stretch, faces: list[Face]) -> float | None
     return min(found, default=None)
 
 
-def _wall_on_both_sides(face: Face, one: _Stretch, depth: float, faces: list[Face]) -> bool:
+def _wall_on_both_sides(face: Face, one: Stretch, depth: float, faces: list[Face]) -> bool:
     """Say if the wall so far behind a stretch is seen on both its sides."""
     width, begin, end = round(2.0 * STRIP_M / CELL_M), face.start_m + CELL_M * one.begin, face.start_m + CELL_M * one.end
     for other in faces:

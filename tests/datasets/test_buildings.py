@@ -8,8 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import shapely
 
 from trihedron.datasets.simulation.buildings import Building
+from trihedron.datasets.simulation.flats import random_flat
 from trihedron.datasets.simulation.raytracing import geometry_of
 from trihedron.datasets.simulation.room import all_faces
 from trihedron.datasets.simulation.shading import render
@@ -57,6 +59,26 @@ def test_the_walk_is_clear_of_everything_and_ends_where_it_began(scene: tuple[Sc
         assert 0.5 < steps.max() * 30 < 1.2 and max(turning) < 65.0
         assert steps.sum() == pytest.approx(length_m, rel=0.06)  # corners are rounded
         assert np.linalg.norm(poses[-1, :3, 3] - poses[0, :3, 3]) < 0.15
+
+
+@pytest.mark.parametrize("number", range(0, 40, 3))
+def test_a_flat_of_a_number_is_whole_and_its_walk_is_clear(number: int) -> None:
+    """Every room is one and can be reached, and the walk leaves furniture alone."""
+    dataset = Synthetic(scene=Scene.random_flat, flat=number)
+    building, (plan,) = random_flat(number), dataset.plans()
+    rooms = [shapely.Polygon(room[0], room[1:]) for room in plan.rooms]
+    assert 3 <= len(rooms) <= 6 and len(plan.doorways) >= len(rooms) - 1
+    places = np.array([building.walk.pose(0, t)[:2, 3] for t in np.linspace(0.0, building.walk.duration_s, 400)])
+    assert all(shapely.contains_xy(room, *places.T).any() for room in rooms)
+    poses = np.array([building.walk.pose(0, t)[:3, 3] for t in np.linspace(0.0, building.walk.duration_s, 400)])
+    assert clearance_m(building, poses) > 0.1
+    again = random_flat(number)
+    assert again.walk == building.walk and len(again.room.solids) == len(building.room.solids)
+
+
+def test_a_number_is_for_random_flats_alone() -> None:
+    with pytest.raises(ValueError, match="flat: only scene=random_flat has a number"):
+        Synthetic(flat=3)
 
 
 def test_walls_hide_what_is_behind_them(scene: tuple[Scene, Building]) -> None:

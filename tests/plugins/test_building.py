@@ -16,9 +16,11 @@ from trihedron.comparison.building_errors import plan_errors
 from trihedron.datasets.simulation.synthetic import Scene, Synthetic
 from trihedron.pipeline.core.drawings import Drawing
 from trihedron.pipeline.core.errors import LibraryError, TrihedronError
+from trihedron.pipeline.core.plan_areas import area_interval, area_sigma, seen_share
 from trihedron.pipeline.core.registry import drawing_of, load_plugins, plugin_class
-from trihedron.pipeline.core.types import OPENING_KINDS, Camera, Frame, Planes, Pose
+from trihedron.pipeline.core.types import OPENING_KINDS, Building, Camera, Frame, Planes, Pose
 from trihedron.pipeline.record.foxglove import TopicView
+from trihedron.plugins.building.cell_complex import Cells, inside_cells
 from trihedron.plugins.building.edges import Edge, end_at_readings, intersect_edges, make_relative, rotate_edge
 from trihedron.plugins.building.faces import Face
 from trihedron.plugins.building.files import building_json, floorplan_svg, summary, write_building
@@ -26,6 +28,7 @@ from trihedron.plugins.building.free_space_kernels import LEVELS
 from trihedron.plugins.building.geometry import door_swing, doors_on, label_place, wall_pieces
 from trihedron.plugins.building.ifc import has_ifc, write_ifc
 from trihedron.plugins.building.openings import fit_jambs, widest_gap
+from trihedron.plugins.building.tall_furniture import Stretch, wall_probability
 from trihedron.plugins.normals.integral_image import IntegralImage
 from trihedron.plugins.planes.connected_components import ConnectedComponents
 from trihedron.tools.benchmarks import building_benchmark
@@ -264,6 +267,63 @@ def test_wardrobes_slanted_walls_and_storeys(scene, name):
         assert len(windows) == 1 and windows[0] == pytest.approx([0.9, 2.0], abs=0.12)
 
 
+@pytest.fixture(scope="module")
+def furnished() -> tuple[Synthetic, Building]:
+    """A flat of four rooms with niches, wardrobes, a shelf of 2 m and doors ajar, by a Kinect's depth."""
+    dataset = Synthetic(scene=Scene.random_flat, flat=6, seed=6, fps=2.5, width=160, height=120, texture=False)
+    truth = dataset.truth()
+    frames = [dataset(k) for k in range(len(dataset))]
+    return dataset, folded("manhattan_layout", [(frame, planes_of(frame), pose_at(k, truth.poses[k])) for k, frame in enumerate(frames)])
+
+
+def test_furniture_is_no_wall_and_niches_belong_to_rooms(furnished):
+    dataset, building = furnished
+    figures = plan_errors(building, np.eye(4), dataset.plans())
+    assert figures["room_f1"] == figures["door_recall"] == figures["door_precision"] == 1.0
+    assert figures["iou"] > 0.99 and figures["wall_m"] < 0.003 and figures["corner_recall"] == 1.0 and figures["corner_precision"] > 0.8
+    assert figures["area_error"] < 0.005 and figures["area_within"] == 1.0
+
+
+def test_what_is_in_doubt_is_in_the_interval_of_an_area(furnished):
+    """The fronts that were taken for walls or furniture count with their probabilities, beside the standard deviations of the walls."""
+    _, building = furnished
+    assert len(building.doubts) > 4 and set(building.doubts[:, 0]) <= set(range(len(building.areas_m2)))
+    for room in range(len(building.areas_m2)):
+        low, high = area_interval(building, room)
+        assert low <= building.areas_m2[room] <= high
+        assert area_sigma(building, room) >= np.sqrt(building.area_variance[room])
+    certain = replace(building, doubts=np.empty((0, 3)))
+    half = 1.96 * np.sqrt(building.area_variance[0])
+    assert area_interval(certain, 0) == pytest.approx(building.areas_m2[0] + np.array([-half, half]), rel=1e-5)
+    likely, hardly = (replace(building, doubts=np.array([[0.0, 2.0, p]])) for p in (0.3, 0.01))
+    assert area_interval(likely, 0)[1] == pytest.approx(building.areas_m2[0] + 2.0, abs=2.0 * half)
+    assert area_interval(hardly, 0)[1] < building.areas_m2[0] + 1.5 * half
+    assert area_sigma(likely, 0) == pytest.approx(np.hypot(half / 1.96, 2.0 * np.sqrt(0.3 * 0.7)))
+
+
+@pytest.mark.parametrize(
+    ("height_m", "over", "prior", "low", "high"),
+    [
+        (2.6, False, 0.25, 0.99, 1.0),  # no furniture is so high
+        (2.0, False, 0.25, 0.2, 0.4),  # a wall is seen behind it
+        (2.4, False, 0.25, 0.6, 0.8),  # but hardly any is so high
+        (2.0, False, 0.75, 0.7, 0.9),  # nothing is seen behind it
+        (2.4, True, 0.75, 0.0, 0.35),  # views look over it
+    ],
+)
+def test_a_front_is_a_wall_with_a_probability(height_m, over, prior, low, high):
+    assert low <= wall_probability(Stretch(0, 20, height_m, over), 2.5, prior) <= high
+
+
+def test_what_no_view_shows_within_a_room_is_inside_and_within_a_wall_is_not():
+    import shapely
+
+    polygons = [shapely.box(0, 0, 4, 1), shapely.box(0, 1, 1, 2), shapely.box(1, 1, 4, 2), shapely.box(0, 2, 4, 2.1), shapely.box(0, 2.1, 4, 4)]
+    edges = [(0, 1, 0.0, 1.0), (0, 2, 0.0, 3.0), (1, 2, 0.0, 1.0), (1, 3, 0.0, 1.0), (2, 3, 1.0, 3.0), (3, 4, 1.0, 4.0)]
+    cells = Cells(polygons, np.array([1.0, 0.1, 1.0, 0.1, 1.0]), edges)
+    assert inside_cells(cells).tolist() == [True, True, True, False, True]
+
+
 def test_a_benchmark_that_was_stopped_goes_on(tmp_path, monkeypatch):
     began = []
 
@@ -409,9 +469,15 @@ def test_names_and_lengths_are_beside_the_swings_of_doors(offices):
     assert len(re.findall('class="length"[^>]*>[0-9]+[.]', floorplan_svg(building))) >= 12
 
 
-def test_a_room_seen_in_part_has_no_standard_deviation_on_its_plan(walk):
+def test_a_room_seen_in_part_has_the_interval_of_its_area_on_its_plan(walk):
     building = folded("manhattan_layout", walk[1][:12])
-    assert "m² seen" in floorplan_svg(building) and "±" not in floorplan_svg(building)
+    assert re.search(r"[0-9.]+ m² seen \([0-9.]+ to [0-9.]+\)", floorplan_svg(building)) and "±" not in floorplan_svg(building)
+    low, high = area_interval(building, 0)
+    assert low < building.areas_m2[0] < building.areas_m2[0] + 1.0 < high  # it may go on where nothing bounds what was seen
+    assert 0.3 < seen_share(building, 0) < 0.9
+    (room,) = building_json(building)["rooms"]
+    assert room["area_interval_m2"] == pytest.approx([low, high], abs=1e-4)
+    assert room["area_sigma_m2"] == pytest.approx(area_sigma(building, 0), abs=1e-4)
 
 
 def test_a_lost_camera_shows_nothing():

@@ -39,7 +39,7 @@ def two_rooms() -> Building:
         np.tile(np.eye(3) * 1e-4, (7, 1, 1)), np.array([[2.0, 0.5, 1.0]]), np.zeros(2, np.int32), np.array([[0, 0, 4], [1, 4, 8]], np.int32),
         np.array(left + right), corner_walls, np.full(8, 0.01), np.array([12.0, 12.0]), np.full(2, 1e-4), np.ones(2, np.bool_),
         np.zeros(1, np.int32), np.zeros(1, np.uint8), np.array([[1.0, 1.9]]), np.array([[0.0, 2.1]]), np.tile(np.eye(4) * 1e-4, (1, 1, 1)),
-        np.array([[0, 1]], np.int32), np.empty(0, np.int32), support,
+        np.array([[0, 1]], np.int32), np.empty(0, np.int32), support, np.empty((0, 3)),
     )  # fmt: skip
 
 

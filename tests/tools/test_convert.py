@@ -10,6 +10,7 @@ import pytest
 from trihedron.pipeline.app.cli import main
 from trihedron.pipeline.core.errors import RecordingError
 from trihedron.pipeline.core.registry import load_plugins, plugin_class
+from trihedron.pipeline.core.types import Building
 from trihedron.pipeline.record import upgrade
 from trihedron.pipeline.record.codec import FORMAT, Encoder, LegacyMessage
 from trihedron.pipeline.record.mcap_file import McapFile
@@ -167,6 +168,28 @@ def test_a_map_without_proposals_is_upgraded(tmp_path):
     assert main(["convert", str(before), str(after)]) == 0
     expected, upgraded = (list(Recording(path).values("map")) for path in (recorded, after))
     assert [Encoder().encode(map) for map in upgraded] == [Encoder().encode(map) for map in expected] and len(upgraded) == 3
+
+
+def test_a_building_without_doubts_is_upgraded(tmp_path):
+    """Version 1 of a building lacks them; none is after it."""
+    recorded, before, after = (tmp_path / f"{name}.mcap" for name in ("recorded", "before", "after"))
+    writer = RecordingWriter(recorded, {})
+    for index in range(3):
+        writer.write("building", Building.empty(index, index, "no plane was seen"))
+    writer.close()
+    rewrite(recorded, before, without_doubts)
+    with pytest.raises(RecordingError, match="holds Building version 1, this program reads version 2; upgrade"):
+        list(Recording(before).values("building"))
+    assert main(["convert", str(before), str(after)]) == 0
+    expected, upgraded = (list(Recording(path).values("building")) for path in (recorded, after))
+    assert [Encoder().encode(one) for one in upgraded] == [Encoder().encode(one) for one in expected] and len(upgraded) == 3
+
+
+def without_doubts(data):
+    message = message_class("Building").FromString(data)
+    message.version = 1
+    message.ClearField("doubts")
+    return message.SerializeToString()
 
 
 def without_proposals(data):

@@ -5,8 +5,8 @@ aligns trajectory.txt with the truth, never by itself. A room is found where the
 edges of found rooms that lie on a face that was seen, position the distance of their middle from the true edge. A doorway is found within 0.3 m of
 its middle. "honest" is the share of errors of areas, wall offsets and storey heights within 1.96 of their standard deviations. Figures are medians
 over the seeds, "honest" a mean. slanted_flat is laid out by atlanta_layout; the seed of random_flat is the number of the flat, too. A second table
-has the measure of methods that are judged on Structured3D: rooms, corners and angles, means over the runs with 95 % intervals (Student's t). A benchmark
-with --out that was stopped goes on where it was.
+has the measure of methods that are judged on Structured3D: rooms, corners and angles, and "area in 95 %", the share of rooms with an area in its
+interval; means over the runs with 95 % intervals (Student's t). A benchmark with --out that was stopped goes on where it was.
 
 Example: trihedron benchmark building --scenes offices --seeds 2
 """
@@ -36,7 +36,7 @@ HEADER = [
     "scene", "sensor", "runs", "wall cm", "angle °", "IoU", "recall", "precision", "doors", "precision", "area %", "height cm", "honest", "frame ms",
     "final s",
 ]  # fmt: skip
-PUBLISHED_HEADER = ["scene", "sensor", "runs", "room P", "room R", "room F1", "corner P", "corner R", "corner F1", "angle F1"]
+PUBLISHED_HEADER = ["scene", "sensor", "runs", "room P", "room R", "room F1", "corner P", "corner R", "corner F1", "angle F1", "area in 95 %"]
 
 
 def main(argv: list[str]) -> int:
@@ -112,7 +112,7 @@ def _figures(run: Path, plugin: str, anew: bool) -> dict[str, float]:
 
 def published_measure(found: dict[str, list[dict[str, float]]]) -> str:
     """Return the table of rooms, corners and angles: means over the runs of each scene and sensor, and their 95 % intervals from three runs on."""
-    columns = ("room_precision", "room_recall", "room_f1", "corner_precision", "corner_recall", "corner_f1", "angle_f1")
+    columns = ("room_precision", "room_recall", "room_f1", "corner_precision", "corner_recall", "corner_f1", "angle_f1", "area_within")
     rows, every = [PUBLISHED_HEADER], [run for runs in found.values() for run in runs]
     for scene, runs in {**found, "all -": every}.items():
         cells = []
