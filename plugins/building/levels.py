@@ -14,6 +14,7 @@ from trihedron.plugins.shared.voxel_hash_kernels import I64
 LEAST_FLOOR_M2 = 1.0
 STOREY_M = 2.0  # least height of a storey
 EYE_M = (0.3, 2.4)  # of the camera above its floor
+SLAB_M = 0.2  # below a floor
 LEVEL_NEAR_M = 0.05  # readings of one level
 
 
@@ -26,6 +27,7 @@ class Storey:
     floor_sigma_m: float = float("nan")
     ceiling_sigma_m: float = float("nan")
     reach_m: float = float("inf")  # the height up to which upright surfaces were seen
+    next_m: float = float("inf")  # from which they are the next storey's
 
     @property
     def bottom_m(self) -> float:
@@ -55,7 +57,7 @@ def storeys_of(evidence: Evidence) -> list[Storey]:
         low_sigma, high_sigma = float(np.hypot(low_sigma, SCALE * low_mean)), float(np.hypot(high_sigma, SCALE * high_mean))
         heights = evidence.points[(evidence.points[:, 2] < high) & (np.abs(evidence.normals[:, 2]) < np.sin(np.radians(UPRIGHT_DEG))), 2]
         reach = float(np.percentile(heights, 98.0)) if len(heights) else float("inf")
-        found.append(Storey(low_mean, high_mean, low_sigma, high_sigma, reach))
+        found.append(Storey(low_mean, high_mean, low_sigma, high_sigma, reach, high - SLAB_M))
     return found
 
 
@@ -63,8 +65,8 @@ def in_storey(evidence: Evidence, storeys: list[Storey], number: int) -> Evidenc
     """Return the evidence between a storey's floor and the next."""
     if len(storeys) == 1:
         return evidence
-    low = storeys[number].bottom_m - 0.2 if number else -np.inf
-    high = storeys[number + 1].bottom_m - 0.2 if number + 1 < len(storeys) else np.inf
+    low = storeys[number].bottom_m - SLAB_M if number else -np.inf
+    high = storeys[number + 1].bottom_m - SLAB_M if number + 1 < len(storeys) else np.inf
     return evidence.select((evidence.points[:, 2] >= low) & (evidence.points[:, 2] < high))
 
 

@@ -19,6 +19,7 @@ from trihedron.plugins.building.looks import looks_at
 FURNITURE_M = (1.8, 2.5)  # heights of what may be taken for a wall, all as likely
 BELOW_CEILING_M = 0.2  # and no nearer to it
 LEAST_LOOKS = 2
+LEAST_LEVELS = 4  # at which views look through below what is read: under a lintel, a beam, the edge of a slab
 LEAST_SHARE = 0.15  # of a stretch's columns, by which its height is judged, and from which it was looked over
 LONG_M = 0.4  # shorter stretches are judged by half of their columns
 PRIORS = {"backed": 0.95, "behind": 0.25, "alone": 0.75}  # probabilities of a wall before its height is known: `_prior`
@@ -49,12 +50,14 @@ class Doubt:
 
 @dataclass(frozen=True)
 class Stretch:
-    """Columns `begin` to `end` of a face, the height up to which they were read and if views looked over them."""
+    """Columns `begin` to `end` of a face, the height up to which they were read, if views looked over them, and if it hangs: views look through below
+    what is read of most columns."""
 
     begin: int
     end: int
     height_m: float
     over: bool
+    hangs: bool = False
 
 
 def remove_furniture(
@@ -88,19 +91,23 @@ def remove_furniture(
 def _stretches(face: Face, evidence: Evidence, storey: Storey) -> list[Stretch]:
     """Compare the heights at which views read the stretches of a face with those at which they read what is behind its line."""
     looks, level = looks_at(face, evidence, storey), np.arange(LEVELS)
-    below = (level + 1.0) * LEVEL_M < (storey.ceiling_m - storey.bottom_m if np.isfinite(storey.ceiling_m) else LEVELS * LEVEL_M)
+    below = (level + 1.0) * LEVEL_M < (storey.ceiling_m if np.isfinite(storey.ceiling_m) else storey.next_m) - storey.bottom_m
     on, beyond = (looks.on >= LEAST_LOOKS) & below, (looks.beyond >= LEAST_LOOKS) & below
     top = np.where(on.any(axis=1), LEVELS - np.argmax(on[:, ::-1], axis=1), 0)  # levels up to the highest that was read
     over = (beyond & (level >= top[:, None])).any(axis=1) & (top * LEVEL_M >= FURNITURE_M[0] - 0.5)
+    under = (beyond & ~on & (level < top[:, None])).sum(axis=1) >= LEAST_LEVELS
     found = []
     for a, b in runs_of(face.tall):
         share = LEAST_SHARE if (b - a) * CELL_M >= LONG_M else 0.5
-        found.append(Stretch(a, b, float(np.quantile(top[a:b], 1.0 - share)) * LEVEL_M, bool(over[a:b].mean() >= LEAST_SHARE)))
+        hangs = under[a:b].mean() > 0.5
+        found.append(Stretch(a, b, float(np.quantile(top[a:b], 1.0 - share)) * LEVEL_M, bool(over[a:b].mean() >= LEAST_SHARE), bool(hangs)))
     return found
 
 
 def wall_probability(one: Stretch, highest: float, prior: float) -> float:
-    """Return the probability that a stretch is a wall: furniture would have to be as high as it was read, and nobody looks over a wall."""
+    """Return the probability that a stretch is a wall: furniture would have to be as high as it was read, nobody looks over a wall; none hangs."""
+    if one.hangs:
+        return 0.0
     as_high = float(np.clip((highest - one.height_m) / (highest - FURNITURE_M[0]), 0.0, 1.0))
     wall, furniture = prior * (MISTAKEN if one.over else 1.0), (1.0 - prior) * as_high
     return wall / (wall + furniture) if wall + furniture > 0.0 else 0.0
