@@ -61,7 +61,24 @@ def random_flat(number: int) -> Building:
     rng = np.random.default_rng([number, 41])
     width, depth = _between(rng, 7.5, 10.5), _between(rng, 6.2, 8.6)
     rooms, partitions = (_corridor_plan if rng.uniform() < 0.35 else _block_plan)(rng, width, depth)
-    doors = _doors(rng, rooms, partitions)
+    return _furnished(rng, (width, depth), rooms, partitions, _doors(rng, rooms, partitions))
+
+
+def whole_floor() -> Building:
+    """Make a floor of eight furnished rooms along a corridor of 20 m; the walk goes through all of them and comes back to where it began."""
+    rng = np.random.default_rng([0, 43])
+    width, depth = 20.0, 11.6
+    rooms, partitions = _floor_plan(rng, width, depth)
+    doors = _all_doors(rng, rooms, partitions)
+    north, south = (sorted((door for door in doors if (door.a == 0) == there), key=lambda door: float(door.middle[0])) for there in (True, False))
+    return _furnished(rng, (width, depth), rooms, partitions, [*north, *south[::-1]])
+
+
+def _furnished(
+    rng: np.random.Generator, size: tuple[float, float], rooms: list[Rectangle], partitions: list[_Partition], doors: list[_Door]
+) -> Building:
+    """Put walls, niches, furniture and door leaves into rooms, and walk through them."""
+    width, depth = size
     path = _path(rooms, doors)
     solids = [solid for wall in partitions for solid in _partition_solids(wall)]
     for room in rooms:
@@ -115,9 +132,61 @@ def _corridor_plan(rng: np.random.Generator, width: float, depth: float) -> tupl
     return rooms, walls
 
 
+def _floor_plan(rng: np.random.Generator, width: float, depth: float) -> tuple[list[Rectangle], list[_Partition]]:
+    """Lay a corridor from west to east, with four rooms on each side."""
+    low = _between(rng, 0.42 * depth, 0.44 * depth)
+    high = low + 1.8
+    south, north = _Partition((0.0, low), (width, low), _thickness(rng)), _Partition((0.0, high), (width, high), _thickness(rng))
+    rooms, walls = [(0.0, width, low + south.depth_m / 2.0, high - north.depth_m / 2.0)], [south, north]
+    for bottom, top in ((high + north.depth_m / 2.0, depth), (0.0, low - south.depth_m / 2.0)):
+        west = 0.0
+        for number in range(4):
+            if number == 3:
+                rooms.append((west, width, bottom, top))
+                continue
+            at = _between(rng, (number + 0.9) * width / 4.0, (number + 1.1) * width / 4.0)
+            walls.append(_Partition((at, bottom), (at, top), _thickness(rng)))
+            rooms.append((west, at - walls[-1].depth_m / 2.0, bottom, top))
+            west = at + walls[-1].depth_m / 2.0
+    return rooms, walls
+
+
 def _doors(rng: np.random.Generator, rooms: list[Rectangle], partitions: list[_Partition]) -> list[_Door]:
     """Join the rooms by doors: as many as reach all of them, and one more in some flats. They are added to their walls."""
-    possible = []
+    possible = _shared_walls(rooms, partitions)
+    found, joined, spare = list[_Door](), {0}, rng.uniform() < 0.3
+    order = [possible[k] for k in rng.permutation(len(possible))]
+    while True:
+        reaching = [item for item in order if (item.a in joined) != (item.b in joined)]
+        more = [item for item in order if not any({item.a, item.b} == {door.a, door.b} for door in found)]
+        chosen = reaching[0] if reaching else more[0] if spare and more else None
+        if chosen is None:
+            return found
+        spare = spare and bool(reaching)
+        found.append(_hang_door(rng, chosen))
+        joined |= {chosen.a, chosen.b}
+
+
+def _all_doors(rng: np.random.Generator, rooms: list[Rectangle], partitions: list[_Partition]) -> list[_Door]:
+    """Join every room to the first by a door."""
+    return [_hang_door(rng, shared) for shared in _shared_walls(rooms, partitions) if 0 in (shared.a, shared.b)]
+
+
+@dataclass(frozen=True)
+class _Shared:
+    """The stretch `low` to `high` of a wall across `axis` (0 = x) that has room `a` before it and `b` behind it."""
+
+    a: int
+    b: int
+    wall: _Partition
+    axis: int
+    low: float
+    high: float
+
+
+def _shared_walls(rooms: list[Rectangle], partitions: list[_Partition]) -> list[_Shared]:
+    """Return the walls between two rooms that are long enough for a door."""
+    found = []
     for a in range(len(rooms)):
         for b in range(len(rooms)):
             for wall in partitions:
@@ -128,23 +197,16 @@ def _doors(rng: np.random.Generator, rooms: list[Rectangle], partitions: list[_P
                 other = 2 * (1 - axis)
                 low, high = max(rooms[a][other], rooms[b][other]), min(rooms[a][other + 1], rooms[b][other + 1])
                 if high - low >= LEAST_SHARED_M:
-                    possible.append((a, b, wall, axis, low, high))
-    found, joined, spare = list[_Door](), {0}, rng.uniform() < 0.3
-    order = [possible[k] for k in rng.permutation(len(possible))]
-    while True:
-        reaching = [item for item in order if (item[0] in joined) != (item[1] in joined)]
-        more = [item for item in order if not any({item[0], item[1]} == {door.a, door.b} for door in found)]
-        chosen = reaching[0] if reaching else more[0] if spare and more else None
-        if chosen is None:
-            return found
-        spare = spare and bool(reaching)
-        a, b, wall, axis, low, high = chosen
-        at = _between(rng, low + LEAST_SHARED_M / 2.0, high - LEAST_SHARED_M / 2.0)
-        across = np.eye(2)[axis]
-        middle = across * wall.start[axis] + np.eye(2)[1 - axis] * at
-        wall.doors.append(at - wall.start[1 - axis])
-        found.append(_Door(a, b, middle, across, wall.depth_m))
-        joined |= {a, b}
+                    found.append(_Shared(a, b, wall, axis, low, high))
+    return found
+
+
+def _hang_door(rng: np.random.Generator, shared: _Shared) -> _Door:
+    """Make a door at a random place of a shared wall, which gets a gap there."""
+    at = _between(rng, shared.low + LEAST_SHARED_M / 2.0, shared.high - LEAST_SHARED_M / 2.0)
+    across = np.eye(2)[shared.axis]
+    shared.wall.doors.append(at - shared.wall.start[1 - shared.axis])
+    return _Door(shared.a, shared.b, across * shared.wall.start[shared.axis] + np.eye(2)[1 - shared.axis] * at, across, shared.wall.depth_m)
 
 
 def _partition_solids(wall: _Partition) -> list[Solid]:

@@ -11,6 +11,9 @@ from trihedron.pipeline.core.linalg import matmul, norm
 from trihedron.pipeline.core.types import F64, Building
 
 TAIL = 0.025  # of a 95 % interval, on each side
+OPEN_SIGMA_M = (
+    0.27  # of the offset of an edge that nothing bounds: the room goes on for 0.5 m with a probability of 0.3, see `plugins.building.doubts`
+)
 MOST = 8  # doubts of a room that are combined; what the others would change is added to the variance
 STEPS = 60  # of the bisection
 
@@ -33,6 +36,12 @@ def area_interval(building: Building, room: int) -> tuple[float, float]:
         shifts.append(float(sum(change for true, (change, _) in zip(chosen, doubts) if true)))
     low, high = (_quantile(np.array(weights), np.array(shifts), sigma, share) for share in (TAIL, 1.0 - TAIL))
     return max(area + low, 0.0), area + high
+
+
+def edge_sigma(building: Building, corner: int) -> float:
+    """Return the standard deviation of the offset, in its room, of the edge that begins at a corner, m."""
+    sigma = float(building.edge_sigma_m[corner])
+    return sigma if np.isfinite(sigma) else OPEN_SIGMA_M
 
 
 def seen_share(building: Building, room: int) -> float:

@@ -89,9 +89,10 @@ def _tall_share(parting: list[tuple[Face, Bool]], a: F64, b: F64) -> float:
     faces = []  # the side they look to, where they are across the stretch, and the share
     for face, columns in parting:
         side = float(matmul(face.normal, across))
-        if abs(side) > LEAST_COSINE:
+        at = np.sign(side) * face.offset_m - float(matmul(middle, across))
+        if abs(side) > LEAST_COSINE and abs(at) < THICKEST_M:
             t0, t1 = sorted((float(matmul(a, face.along)), float(matmul(b, face.along))))
-            faces.append((np.sign(side), np.sign(side) * face.offset_m - float(matmul(middle, across)), face.share(t0, t1, columns)))
+            faces.append((np.sign(side), at, face.share(t0, t1, columns)))
     best = max((share for _, at, share in faces if abs(at) < ON_LINE_M), default=0.0)
     for side in {side for side, at, _ in faces if abs(at) < ON_LINE_M}:
         behind = [(-side * at, share) for other, at, share in faces if other == -side and ON_LINE_M < -side * at < THICKEST_M]

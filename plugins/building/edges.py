@@ -84,7 +84,8 @@ def _is_backed(normal: F64, offset_m: float, p: F64, q: F64, faces: list[Face]) 
 
 
 def fit_edge(edge: Edge, evidence: Evidence, storey: Storey) -> None:
-    """Fit the edge's offset to the points of its own stretch, those above doors and pictures if there are enough."""
+    """Fit the edge's offset to the points of its own stretch, those above doors and pictures if there are enough; without any it is where its face
+    ends, to half a cell."""
     if edge.face is None:
         return
     for within in (FIT_M, FIT_M):
@@ -92,6 +93,7 @@ def fit_edge(edge: Edge, evidence: Evidence, storey: Storey) -> None:
         high = mask[evidence.points[mask, 2] - storey.bottom_m > tall_m(storey)]
         mask = high if len(high) >= LEAST_POINTS else mask
         if len(mask) == 0:
+            edge.sigma_m = CELL_M / 2.0 if np.isnan(edge.sigma_m) else edge.sigma_m
             return
         rows = evidence.rows[mask]
         offset, sigma = mean_over_views(matmul(evidence.points[mask, :2], edge.normal), evidence.information[mask], rows)

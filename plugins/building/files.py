@@ -16,7 +16,7 @@ import numpy as np
 from trihedron.pipeline.core.descriptions import summary_of_building
 from trihedron.pipeline.core.files import new_file, write_file
 from trihedron.pipeline.core.linalg import norm
-from trihedron.pipeline.core.plan_areas import area_interval, area_sigma, seen_share
+from trihedron.pipeline.core.plan_areas import area_interval, area_sigma, edge_sigma, seen_share
 from trihedron.pipeline.core.registry import register_files
 from trihedron.pipeline.core.types import ELEMENTS, F64, OPENING_KINDS, SUPPORTS, Building
 from trihedron.plugins.building.edits import missing_edits
@@ -127,6 +127,7 @@ def _room(building: Building, k: int) -> dict[str, Any]:
         "holes": [_numbers(building.corners_m[a:b]) for a, b in rings[1:]],
         "walls": [building.corner_walls[a:b].tolist() for a, b in rings], "area_m2": _numbers(building.areas_m2[k]),
         "area_sigma_m2": _numbers(area_sigma(building, k)), "area_interval_m2": _numbers(np.array(area_interval(building, k))),
+        "edge_sigma_m": [[_numbers(edge_sigma(building, corner)) for corner in range(a, b)] for a, b in rings],
         "seen_share": _numbers(seen_share(building, k)), "closed": bool(building.closed[k]), "support": _support(building, "room", k),
     }  # fmt: skip
 

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trihedron.pipeline.core.linalg import inv
-from trihedron.pipeline.core.types import I32
+from trihedron.pipeline.core.types import F64, I32
 from trihedron.plugins.building.evidence import Evidence
 from trihedron.plugins.building.faces import Face
 from trihedron.plugins.building.free_space import CELL_M, LEVEL_M
@@ -27,12 +26,12 @@ class Looks:
     beyond: I32
 
 
-def looks_at(face: Face, evidence: Evidence, storey: Storey) -> Looks:
-    """Count the looks of all views at a face."""
+def looks_at(face: Face, evidence: Evidence, storey: Storey, inverses: list[F64]) -> Looks:
+    """Count the looks of all views, whose poses' inverses `T_camera_building` are given, at a face."""
     columns = len(face.count)
     line = (face.start_m + (np.arange(columns) + 0.5) * CELL_M)[:, None] * face.along + face.offset_m * face.normal
     heights = np.asarray(storey.bottom_m + (np.arange(LEVELS) + 0.5) * LEVEL_M, np.float64)
     on, beyond = np.zeros((columns, LEVELS), np.int32), np.zeros((columns, LEVELS), np.int32)
-    for view, T in zip(evidence.views, evidence.poses):
-        looks_kernel(view.depth_m, view.camera.intrinsics, inv(T), line, face.normal, heights, NEAREST_M, MARGIN, on, beyond)
+    for view, T in zip(evidence.views, inverses):
+        looks_kernel(view.depth_m, view.camera.intrinsics, T, line, face.normal, heights, NEAREST_M, MARGIN, on, beyond)
     return Looks(on, beyond)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from trihedron.pipeline.core.linalg import matmul, norm
+from trihedron.pipeline.core.linalg import inv, matmul, norm
 from trihedron.pipeline.core.types import F64
 from trihedron.plugins.building.evidence import Evidence
 from trihedron.plugins.building.faces import Face, longest_run, runs_of
@@ -66,7 +66,8 @@ def remove_furniture(
     """Return the faces without the stretches that are rather furniture than walls, and how certain that is of each stretch. What stands behind those
     removed is marked in `space`; a face of which less than `least_m` is left is none unless it reaches higher than furniture."""
     highest = min(FURNITURE_M[1], storey.ceiling_m - storey.bottom_m - BELOW_CEILING_M) if np.isfinite(storey.ceiling_m) else FURNITURE_M[1]
-    stretches = [_stretches(face, evidence, storey) for face in faces]
+    inverses = [inv(T) for T in evidence.poses]
+    stretches = [_stretches(face, evidence, storey, inverses) for face in faces]
     faces = [_with_known(face, found, highest, faces) for face, found in zip(faces, stretches)]
     kept, doubts = [], []
     for face, found in zip(faces, stretches):
@@ -88,9 +89,9 @@ def remove_furniture(
     return kept, [doubt for doubt in doubts if 0.0 < doubt.wall_probability < 1.0]
 
 
-def _stretches(face: Face, evidence: Evidence, storey: Storey) -> list[Stretch]:
+def _stretches(face: Face, evidence: Evidence, storey: Storey, inverses: list[F64]) -> list[Stretch]:
     """Compare the heights at which views read the stretches of a face with those at which they read what is behind its line."""
-    looks, level = looks_at(face, evidence, storey), np.arange(LEVELS)
+    looks, level = looks_at(face, evidence, storey, inverses), np.arange(LEVELS)
     below = (level + 1.0) * LEVEL_M < (storey.ceiling_m if np.isfinite(storey.ceiling_m) else storey.next_m) - storey.bottom_m
     on, beyond = (looks.on >= LEAST_LOOKS) & below, (looks.beyond >= LEAST_LOOKS) & below
     top = np.where(on.any(axis=1), LEVELS - np.argmax(on[:, ::-1], axis=1), 0)  # levels up to the highest that was read

@@ -15,7 +15,7 @@ from trihedron.pipeline.core import types
 from trihedron.pipeline.core.described import Described
 from trihedron.pipeline.core.errors import DataError, UsageError
 from trihedron.pipeline.core.linalg import matmul, norm
-from trihedron.pipeline.core.plan_areas import area_interval, area_sigma, seen_share
+from trihedron.pipeline.core.plan_areas import area_interval, area_sigma, edge_sigma, seen_share
 from trihedron.pipeline.core.types import F64, OPENING_KINDS, Pose
 from trihedron.plugins.building.geometry import quad, rings_of
 from trihedron.plugins.building.labels import name_of, use_of
@@ -23,7 +23,7 @@ from trihedron.plugins.building.labels import name_of, use_of
 if TYPE_CHECKING:
     import shapely
 
-OPEN_SIGMA_M = 0.05  # of an edge that nothing bounds, and of where a wall was last seen
+END_SIGMA_M = 0.05  # of where a wall was last seen
 PARALLEL_DEG = 5.0  # between walls that have a distance
 BELOW_M = 0.3  # below its floor that a storey begins
 
@@ -374,7 +374,7 @@ class Building:
 
     def _end_sigma(self, wall: int, end: F64) -> float:
         """Return the standard deviation of an end (2,) of a wall along it: that of the edge which meets it there."""
-        best = (np.inf, OPEN_SIGMA_M)
+        best = (np.inf, END_SIGMA_M)
         for _, a, b in self.plan.loops:
             for j in range(a, b):
                 before = a + (j - a - 1) % (b - a)
@@ -385,8 +385,7 @@ class Building:
 
     def _edge_sigma(self, corner: int) -> float:
         """Return the standard deviation of the offset, in its room, of the edge that begins at a corner."""
-        sigma = float(self.plan.edge_sigma_m[corner])
-        return sigma if np.isfinite(sigma) else OPEN_SIGMA_M
+        return edge_sigma(self.plan, corner)
 
     def _room(self, k: int) -> Room:
         outer, *holes = rings_of(self.plan, k)
@@ -407,7 +406,7 @@ class Building:
             after, before = a + (j - a + 1) % (b - a), a + (j - a - 1) % (b - a)
             p, q = self.plan.corners_m[j], self.plan.corners_m[after]
             sines = np.abs(np.sin(_turns(self.plan.corners_m[a:b])))[[j - a, after - a]]
-            ends = [OPEN_SIGMA_M if sine < 0.1 else self._edge_sigma(k) / sine for sine, k in zip(sines, (before, after))]
+            ends = [END_SIGMA_M if sine < 0.1 else self._edge_sigma(k) / sine for sine, k in zip(sines, (before, after))]
             sigma = np.hypot(ends[0], ends[1])
             wall = int(self.plan.corner_walls[j])
             found.append(Edge(p, q, Measurement(float(norm(q - p)), float(sigma)), wall if wall >= 0 else None))

@@ -11,7 +11,7 @@ import pytest
 import shapely
 
 from trihedron.datasets.simulation.buildings import Building
-from trihedron.datasets.simulation.flats import random_flat
+from trihedron.datasets.simulation.flats import random_flat, whole_floor
 from trihedron.datasets.simulation.raytracing import geometry_of
 from trihedron.datasets.simulation.room import all_faces
 from trihedron.datasets.simulation.shading import render
@@ -74,6 +74,15 @@ def test_a_flat_of_a_number_is_whole_and_its_walk_is_clear(number: int) -> None:
     assert clearance_m(building, poses) > 0.1
     again = random_flat(number)
     assert again.walk == building.walk and len(again.room.solids) == len(building.room.solids)
+
+
+def test_a_whole_floor_has_eight_rooms_on_a_corridor() -> None:
+    (plan,) = Synthetic(scene=Scene.whole_floor).plans()
+    building = whole_floor()
+    assert (len(plan.rooms), len(plan.doorways)) == (9, 8)
+    places = np.array([building.walk.pose(0, t)[:3, 3] for t in np.linspace(0.0, building.walk.duration_s, 1000)])
+    assert building.walk.length_m == pytest.approx(179.8, abs=0.1) and clearance_m(building, places) > 0.1
+    assert all(shapely.contains_xy(shapely.Polygon(room[0], room[1:]), *places[:, :2].T).any() for room in plan.rooms)
 
 
 def test_a_number_is_for_random_flats_alone() -> None:

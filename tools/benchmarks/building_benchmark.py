@@ -30,6 +30,7 @@ from trihedron.tools.arguments import Parser
 
 SCENES = ("offices", "rooms", "corridor", "flat", "slanted_flat", "house")
 FURNISHED = "random_flat"
+MORE = (FURNISHED, "whole_floor")  # on demand
 LAYOUTS = {"slanted_flat": "atlanta_layout"}  # of the slot building; the other scenes have the graph's own
 SENSORS = ("kinect", "stereo")
 HEADER = [
@@ -42,7 +43,7 @@ PUBLISHED_HEADER = ["scene", "sensor", "runs", "room P", "room R", "room F1", "c
 def main(argv: list[str]) -> int:
     """Print the table; returns the exit code. Raises UsageError for an unknown scene or plugin, DataError for a run without a plan."""
     parser = Parser("benchmark building", __name__)
-    parser.add_argument("--scenes", default=",".join(SCENES), metavar="A,B", help=f"some of them, or {FURNISHED} (default: {','.join(SCENES)})")
+    parser.add_argument("--scenes", default=",".join(SCENES), metavar="A,B", help=f"some of them, or {', '.join(MORE)} (default: {','.join(SCENES)})")
     parser.add_argument("--seeds", type=int, default=5, metavar="N", help="runs of each scene (default: 5)")
     parser.add_argument("--first-seed", type=int, default=0, metavar="N", help="seed of the first (default: 0)")
     parser.add_argument("--sensors", default=",".join(SENSORS), metavar="A,B", help=f"of the depth noise (default: {','.join(SENSORS)})")
@@ -60,7 +61,7 @@ def main(argv: list[str]) -> int:
         raise UsageError("benchmark building", f"--first-seed {options.first_seed} is negative", "give 0 or more")
     if not 1.0 <= options.fps <= 60.0:
         raise UsageError("benchmark building", f"--fps {options.fps:g} is out of range", "give 1 to 60")
-    scenes, sensors = _split_names("scene", options.scenes, (*SCENES, FURNISHED)), _split_names("sensor", options.sensors, SENSORS)
+    scenes, sensors = _split_names("scene", options.scenes, (*SCENES, *MORE)), _split_names("sensor", options.sensors, SENSORS)
     found: dict[str, list[dict[str, float]]] = {}
     with tempfile.TemporaryDirectory() as folder:
         for scene in scenes:
