@@ -35,8 +35,10 @@ def main(argv: list[str]) -> int:
     from trihedron.pipeline.core.libraries import library_error
     from trihedron.pipeline.core.registry import load_plugins, plugins_of
     from trihedron.pipeline.record.reader import Recording
-    from trihedron.plugins.building.files import DXF, GLB, JSON, SVG, write_building
+    from trihedron.plugins.building.dxf import DXF
+    from trihedron.plugins.building.files import GLB, JSON, write_building
     from trihedron.plugins.building.ifc import IFC, has_ifc, write_ifc
+    from trihedron.plugins.building.svg import SVG
 
     load_plugins()
     if options.plugin is not None and options.plugin not in plugins_of("building"):
@@ -48,7 +50,7 @@ def main(argv: list[str]) -> int:
         raise UsageError(str(out / JSON), "holds corrections by hand, which would be lost", f"give --edits {out / JSON}, or another --out FOLDER")
     try:
         out.mkdir(parents=True, exist_ok=True)
-        for line in write_building(out, building):
+        for line in write_building(out, building, path.resolve().parent.name if path.name == RECORDING else path.stem):
             print(line)
         if has_ifc():
             write_ifc(out / IFC, building)
