@@ -26,11 +26,16 @@ SCHEMA_VERSION = 1
 
 
 @register_files("building")
+def write_run_files(out: Path, building: Building) -> list[str]:
+    """Write the files of a run folder, whose name the plan has; returns lines as `write_building` does."""
+    return write_building(out, building, out.resolve().name)
+
+
 def write_building(out: Path, building: Building, name: str = "") -> list[str]:
-    """Write the files of a run folder; returns a line that describes them, and one for each correction by hand that no element has. `name` is what
-    the plan's title says, that of the folder by default."""
+    """Write the files into a folder; returns a line that describes them, and one for each correction by hand that no element has. `name` is that of
+    the run, for the plan's title."""
     write_json(out / JSON, building)
-    write_svg(out / SVG, building, name or out.resolve().name)
+    write_svg(out / SVG, building, name)
     write_dxf(out / DXF, building)
     write_glb(out / GLB, building)
     return [summary(building), *missing_edits(building)]

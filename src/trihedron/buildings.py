@@ -280,6 +280,24 @@ class Building:
 
         return self._write(path, partial(write_svg, name=name))
 
+    def to_pdf(self, path: str | Path, name: str = "") -> Path:
+        """Write the floor plan as PDF, to scale.
+
+        Args:
+            path: the file; it is overwritten.
+            name: what the title says that it is a plan of.
+
+        Returns:
+            The path.
+
+        Raises:
+            DataError: the file cannot be written.
+            LibraryError: matplotlib is not installed.
+        """
+        from trihedron.plugins.building.pdf import write_pdf
+
+        return self._write(path, partial(write_pdf, name=name))
+
     def to_dxf(self, path: str | Path) -> Path:
         """Write the floor plan as DXF.
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import sys
 from dataclasses import replace
-from functools import partial
 from xml.etree import ElementTree
 
 import numpy as np
@@ -229,7 +228,7 @@ def test_a_block_in_a_room_is_a_hole_of_its_polygon():
 def test_each_file_is_written_alone(offices, tmp_path):
     plan = th.Building(offices["manhattan_layout"])
     plan.save(tmp_path / "all")
-    alone = {"building.json": plan.to_json, "floorplan.svg": partial(plan.to_svg, name="all"), "floorplan.dxf": plan.to_dxf}
+    alone = {"building.json": plan.to_json, "floorplan.svg": plan.to_svg, "floorplan.dxf": plan.to_dxf}
     alone |= {"building.glb": plan.to_glb, "model.ifc": plan.to_ifc}
     for name, write in alone.items():
         assert write(str(tmp_path / name)) == tmp_path / name

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import sys
+import zlib
 from dataclasses import replace
 from xml.etree import ElementTree
 
@@ -11,13 +13,18 @@ import pytest
 import shapely
 from two_rooms import two_rooms
 
+import trihedron as th
+from trihedron.pipeline.core.errors import LibraryError
+from trihedron.pipeline.core.registry import write_files_of
 from trihedron.pipeline.core.types import OPENING_KINDS, Building
+from trihedron.pipeline.record.writer import RecordingWriter
 from trihedron.plugins.building.dimensions import chains_of
-from trihedron.plugins.building.files import write_building
 from trihedron.plugins.building.geometry import box_place
+from trihedron.plugins.building.pdf import write_pdf
 from trihedron.plugins.building.plan_drawing import draw_plan
 from trihedron.plugins.building.sheet import Letters, Shape, Sheet
 from trihedron.plugins.building.svg import floorplan_svg
+from trihedron.tools import building as command
 
 PX = 60.0  # a metre of the SVG
 
@@ -138,7 +145,7 @@ def test_the_title_is_the_run_and_its_day_where_the_stamps_tell_one(tmp_path):
     assert "Floor plan of walk & <talk>" in texts_of(two_rooms(), "walk & <talk>")
     assert "Floor plan of walk, 2026-01-02" in texts_of(replace(two_rooms(), stamp_ns=1767312000 * 10**9), "walk")
     (tmp_path / "walk").mkdir()
-    write_building(tmp_path / "walk", two_rooms())
+    write_files_of("building", tmp_path / "walk", two_rooms())
     assert (tmp_path / "walk" / "floorplan.svg").read_text() == floorplan_svg(two_rooms(), "walk")
 
 
@@ -147,3 +154,53 @@ def test_the_sheet_is_cropped_to_what_is_drawn():
     points = np.concatenate([mark.corners() for mark in sheet.marks()])
     assert points.min(axis=0) == pytest.approx([14.0, 14.0]) and points.max(axis=0) == pytest.approx(sheet.size - 14.0)
     assert 8.1 * PX < sheet.size[0] < 8.1 * PX + 100.0
+
+
+def operators_of(path) -> str:
+    """The drawing operators of a PDF."""
+    return zlib.decompress(re.search(rb"stream\r?\n(.*?)\r?\nendstream", path.read_bytes(), re.DOTALL)[1]).decode("latin-1")
+
+
+def page_mm(path) -> list[float]:
+    """Width and height of the page of a PDF."""
+    box = re.search(rb"/MediaBox \[([^\]]*)\]", path.read_bytes())[1].split()
+    return [round(float(value) / 72.0 * 25.4, 2) for value in box[2:]]
+
+
+@pytest.mark.parametrize(
+    ("size", "scale", "page"),
+    [(1.0, 50, [210.0, 297.0]), (1.5, 50, [297.0, 210.0]), (2.0, 50, [420.0, 297.0]), (3.0, 100, [297.0, 210.0]), (6.0, 200, [297.0, 210.0])],
+)
+def test_a_metre_is_as_long_in_the_pdf_as_its_scale_says(tmp_path, size, scale, page):
+    path = th.Building(shrunk(two_rooms(), size)).to_pdf(tmp_path / "plan.pdf", name="walk")
+    assert page_mm(path) == pytest.approx(page, abs=0.01)
+    lines = [[float(number) for number in line] for line in re.findall(r"(\S+) (\S+) m\n(\S+) (\S+) l\n", operators_of(path))]
+    lengths_mm = [np.hypot(x1 - x0, y1 - y0) * 25.4 / 72.0 for x0, y0, x1, y1 in lines]
+    for metres in (2.0, 8.1 * size, 3.0 * size):  # the scale bar, and two dimensions
+        assert min(abs(length - metres * 1000.0 / scale) for length in lengths_mm) < 0.001
+
+
+def test_what_fits_no_paper_has_a_page_of_its_own_and_equal_plans_are_equal_files(tmp_path):
+    building = shrunk(two_rooms(), 20.0)
+    for name in ("a.pdf", "b.pdf"):
+        write_pdf(tmp_path / name, building, "$walk$")
+    assert (tmp_path / "a.pdf").read_bytes() == (tmp_path / "b.pdf").read_bytes()
+    assert page_mm(tmp_path / "a.pdf")[0] > 810.0
+
+
+def test_without_matplotlib_one_line_says_so(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    with pytest.raises(LibraryError) as error:
+        th.Building(two_rooms()).to_pdf(tmp_path / "plan.pdf")
+    assert str(error.value) == "matplotlib: is not installed; install it with: pip install matplotlib" and list(tmp_path.iterdir()) == []
+
+
+def test_the_command_writes_the_pdf_where_it_is_asked_for(tmp_path, capsys):
+    (tmp_path / "walk").mkdir()
+    writer = RecordingWriter(tmp_path / "walk" / "run.mcap", {"overrides": "[]", "config": "seed: 0"})
+    writer.write("building", two_rooms())
+    writer.close()
+    assert command.main([str(tmp_path / "walk"), "--out", str(tmp_path / "plan"), "--pdf"]) == 0
+    assert f"  {tmp_path}/plan/floorplan.pdf\n" in capsys.readouterr().out
+    th.Building(two_rooms()).to_pdf(tmp_path / "walk.pdf", name="walk")
+    assert (tmp_path / "plan" / "floorplan.pdf").read_bytes() == (tmp_path / "walk.pdf").read_bytes()
