@@ -129,7 +129,8 @@ def _is_door(building: Building, opening: int) -> bool:
 
 
 def box_place(free: Any, wide: float, high: float) -> F64 | None:
-    """Return the middle (2,) of a box within a region where it is farthest from the outline: the pole of inaccessibility; None where no box fits."""
+    """Return the middle (2,) of a box within a region where it is about as far from the outline as it can be (the pole of inaccessibility), of all
+    such places that nearest to the region's centroid; None where no box fits."""
     import shapely
 
     corners = np.array([[-wide, -high], [wide, -high], [wide, high], [-wide, high]]) / 2.0
@@ -138,7 +139,12 @@ def box_place(free: Any, wide: float, high: float) -> F64 | None:
     middles = shapely.difference(free, shapely.union_all(swept))
     if middles.is_empty or middles.area < 1e-9:
         return None
-    return np.array(shapely.maximum_inscribed_circle(middles, 0.01 * high).coords[0])
+    radius = shapely.maximum_inscribed_circle(middles, 0.01 * high).length
+    _, place = shapely.shortest_line(free.centroid, middles.buffer(-LEEWAY * radius)).coords
+    return np.array(place)
+
+
+LEEWAY = 0.9  # of the greatest distance from the outline, that is enough
 
 
 # In 3D.

@@ -120,7 +120,7 @@ def test_the_files_hold_what_was_found_and_open_in_other_readers(offices, tmp_pa
     ElementTree.fromstring((tmp_path / "floorplan.svg").read_text())
     document = ezdxf.readfile(tmp_path / "floorplan.dxf")
     assert not document.audit().errors
-    assert len(document.modelspace().query('LWPOLYLINE[layer=="ROOMS"]')) == 3 and len(document.modelspace().query('*[layer=="DOORS"]')) == 2
+    assert len(document.modelspace().query('LWPOLYLINE[layer=="A-AREA"]')) == 3 and len(document.modelspace().query('ARC[layer=="A-DOOR"]')) == 2
 
 
 def test_walls_are_cut_at_doors(offices):

