@@ -238,3 +238,24 @@ def test_walls_that_were_not_seen_are_on_a_layer_of_their_own(tmp_path):
 def test_a_plan_of_nothing_is_a_dxf(tmp_path):
     none = th.Building(Building.empty(0, 0, "no plane was seen")).to_dxf(tmp_path / "none.dxf")
     assert ezdxf.readfile(none).audit().errors == []
+
+
+def test_the_ifc_has_axes_a_material_and_the_evidence(tmp_path):
+    import ifcopenshell
+    from ifcopenshell.util.element import get_material, get_pset
+    from ifcopenshell.validate import json_logger, validate
+
+    model, logger = ifcopenshell.open(th.Building(with_window(two_rooms())).to_ifc(tmp_path / "model.ifc")), json_logger()
+    validate(model, logger, express_rules=True)
+    assert logger.statements == []
+    walls = model.by_type("IfcWall")
+    for wall, length in zip(walls, (3.0, 4.0, 4.0, 3.0, 4.0, 3.0, 4.0)):
+        axis, body = sorted(wall.Representation.Representations, key=lambda shape: str(shape.RepresentationIdentifier))
+        assert (axis.RepresentationIdentifier, axis.RepresentationType, body.RepresentationIdentifier) == ("Axis", "Curve2D", "Body")
+        (first, last), depth = axis.Items[0].Points.CoordList, 0.1 if wall is walls[0] else 0.06
+        assert first == pytest.approx((0.0, -depth / 2.0)) and last == pytest.approx((length, -depth / 2.0))
+    assert {get_material(part).Name for part in [*walls, *model.by_type("IfcSlab")]} == {"unknown"}
+    found = get_pset(walls[0], "Trihedron_Measurement")
+    assert (found["OffsetSigma"], found["DirectionSigma"]) == (pytest.approx(0.01), pytest.approx(0.01))
+    assert (found["Keyframes"], found["Frames"]) == (0, 1) and get_pset(walls[0], "Pset_WallCommon") is None
+    assert get_pset(model.by_type("IfcOpeningElement")[0], "Trihedron_Measurement")["Frames"] == 1
