@@ -24,6 +24,7 @@ MEANINGS = {
 }
 THIN = "thin walls: the other face was not seen"
 LINE, SWATCH, NARROWEST = 14.0, 26.0, 380.0  # points: between lines, wide a swatch, for the lines of text
+SMALL = 20.0  # points a metre, of a scale whose bar is in steps of five metres
 FIRST_DATE_S = 946684800  # 2000-01-01; stamps before it are no times of day
 
 
@@ -76,14 +77,13 @@ def _height(value: float) -> str:
 
 
 def _scale_bar(per_m: float) -> Iterator[Mark]:
-    """Draw two metres, and north."""
-    y = 0.8 * LINE
-    yield line("scale", (0.0, y), (2.0 * per_m, y))
-    for metres in range(3):
+    """Draw two metres, ten on a small scale, and north."""
+    y, step = 0.8 * LINE, 1 if per_m > SMALL else 5
+    yield line("scale", (0.0, y), (2 * step * per_m, y))
+    for metres in (0, step, 2 * step):
         yield line("scale", (metres * per_m, y - 4.0), (metres * per_m, y + 4.0))
-        text = f"{metres} m"
-        yield Letters("length", text, np.array([metres * per_m, y + 12.0]))
-    x = 2.0 * per_m + 60.0
+        yield Letters("length", f"{metres} m", np.array([metres * per_m, y + 12.0]))
+    x = 2 * step * per_m + 60.0
     yield line("scale", (x, y + 4.0), (x, y - 20.0))
     yield line("scale", (x - 5.0, y - 10.0), (x, y - 20.0), (x + 5.0, y - 10.0))
     yield Letters("length", "N: first view", np.array([x, y + 12.0]))
