@@ -2,7 +2,8 @@
 
 RUN is a run folder or its recording. A building that is recorded (outputs=[trajectory,building]) is written as it is; else, or with --plugin, it is
 made from the frames, planes and poses of the recording. Metres; z up from the lowest floor, y (north on the plan) the direction of the building
-nearest to the first camera's view. model.ifc needs ifcopenshell: pip install 'trihedron[ifc]'.
+nearest to the first camera's view. model.ifc needs ifcopenshell: pip install 'trihedron[ifc]'. --pdf adds floorplan.pdf, at 1:50, 1:100 or 1:200
+on A4 or A3.
 
 Corrections are made in building.json: "deleted": true, another kind, a name, a use, an opening without an id. --edits building.json keeps them.
 
@@ -31,12 +32,16 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--plugin", metavar="NAME", help="make it anew by this plugin, for example atlanta_layout (default: as recorded)")
     parser.add_argument("--edits", metavar="FILE", help="a building.json that was corrected by hand; what was changed there is kept")
     parser.add_argument("--out", metavar="FOLDER", type=Path, help="where to write (default: beside the recording)")
+    parser.add_argument("--pdf", action="store_true", help="write floorplan.pdf too, to scale")
     options = parser.parse_args(argv)
     from trihedron.pipeline.core.libraries import library_error
     from trihedron.pipeline.core.registry import load_plugins, plugins_of
     from trihedron.pipeline.record.reader import Recording
-    from trihedron.plugins.building.files import DXF, GLB, JSON, SVG, write_building
+    from trihedron.plugins.building.dxf import DXF
+    from trihedron.plugins.building.files import GLB, JSON, write_building
     from trihedron.plugins.building.ifc import IFC, has_ifc, write_ifc
+    from trihedron.plugins.building.pdf import PDF, write_pdf
+    from trihedron.plugins.building.svg import SVG
 
     load_plugins()
     if options.plugin is not None and options.plugin not in plugins_of("building"):
@@ -48,14 +53,17 @@ def main(argv: list[str]) -> int:
         raise UsageError(str(out / JSON), "holds corrections by hand, which would be lost", f"give --edits {out / JSON}, or another --out FOLDER")
     try:
         out.mkdir(parents=True, exist_ok=True)
-        for line in write_building(out, building):
+        name = path.resolve().parent.name if path.name == RECORDING else path.stem
+        for line in write_building(out, building, name):
             print(line)
+        if options.pdf:
+            write_pdf(out / PDF, building, name)
         if has_ifc():
             write_ifc(out / IFC, building)
     except OSError as error:
         raise DataError(str(error.filename or out), f"cannot be written: {error.strerror}", "give another --out FOLDER") from error
-    for name in (JSON, SVG, DXF, GLB, *((IFC,) if has_ifc() else ())):
-        print(f"  {out / name}")
+    for file in (JSON, SVG, *((PDF,) if options.pdf else ()), DXF, GLB, *((IFC,) if has_ifc() else ())):
+        print(f"  {out / file}")
     if not has_ifc():
         print(f"no {IFC}: {library_error('ifcopenshell')}")
     return 0

@@ -24,7 +24,8 @@ from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import attached_truth, read_trajectory
 from trihedron.pipeline.run.metrics import FEWEST_POSES, aligned_errors, associate
 from trihedron.pipeline.run.result_files import read_results
-from trihedron.plugins.building.files import floorplan_svg, summary
+from trihedron.plugins.building.files import summary
+from trihedron.plugins.building.svg import floorplan_svg
 from trihedron.tools.page_figures import (
     DASHES,
     TRUTH,
@@ -192,7 +193,7 @@ def drawings_of(folders: Mapping[str, Path], triangles: int = MOST_TRIANGLES) ->
 
 
 def _plan(name: str, building: Building) -> dict[str, Any]:
-    picture = {"kind": "svg+xml", "data": encode(floorplan_svg(building).encode()), "alt": f"Floor plan of {name}"}
+    picture = {"kind": "svg+xml", "data": encode(floorplan_svg(building, name).encode()), "alt": f"Floor plan of {name}"}
     return {"text": f"{name}: {summary(building)}", "picture": picture}
 
 

@@ -11,25 +11,24 @@ from trihedron.pipeline.core.linalg import matmul, norm
 from trihedron.pipeline.core.types import F64, Building
 
 TAIL = 0.025  # of a 95 % interval, on each side
-OPEN_SIGMA_M = (
-    0.27  # of the offset of an edge that nothing bounds: the room goes on for 0.5 m with a probability of 0.3, see `plugins.building.doubts`
-)
-MOST = 8  # doubts of a room that are combined; what the others would change is added to the variance
+OPEN_SIGMA_M = 0.27  # of the offset of an edge that nothing bounds: the room goes on for 0.5 m with a probability of 0.3
+MOST = 8  # doubts that are combined; what the others would change is added to the variance
 STEPS = 60  # of the bisection
 
 
-def area_sigma(building: Building, room: int) -> float:
-    """Return the standard deviation of the area of a room, m²."""
-    doubts = _doubts(building, room)
-    return float(np.sqrt(building.area_variance[room] + (doubts[:, 0] ** 2 * doubts[:, 1] * (1.0 - doubts[:, 1])).sum()))
+def area_sigma(building: Building, *rooms: int) -> float:
+    """Return the standard deviation of the area of rooms, which are independent of each other, m²."""
+    doubts = _doubts(building, rooms)
+    return float(np.sqrt(building.area_variance[list(rooms)].sum() + (doubts[:, 0] ** 2 * doubts[:, 1] * (1.0 - doubts[:, 1])).sum()))
 
 
-def area_interval(building: Building, room: int) -> tuple[float, float]:
-    """Return the 95 % interval of the area of a room, m²: of the mixture of normal distributions in which each doubt is true or not."""
-    doubts, area = _doubts(building, room), float(building.areas_m2[room])
+def area_interval(building: Building, *rooms: int) -> tuple[float, float]:
+    """Return the 95 % interval of the area of rooms, m²: of the mixture of normal distributions in which each doubt is true or not. The rooms are
+    independent of each other."""
+    doubts, area = _doubts(building, rooms), float(building.areas_m2[list(rooms)].sum())
     doubts = doubts[np.argsort(-(doubts[:, 0] ** 2) * doubts[:, 1] * (1.0 - doubts[:, 1]), kind="stable")]
     rest = doubts[MOST:]
-    sigma = sqrt(max(float(building.area_variance[room] + (rest[:, 0] ** 2 * rest[:, 1] * (1.0 - rest[:, 1])).sum()), 1e-12))
+    sigma = sqrt(max(float(building.area_variance[list(rooms)].sum() + (rest[:, 0] ** 2 * rest[:, 1] * (1.0 - rest[:, 1])).sum()), 1e-12))
     weights, shifts = [], []
     for chosen in product((False, True), repeat=min(len(doubts), MOST)):
         weights.append(float(np.prod([p if true else 1.0 - p for true, (_, p) in zip(chosen, doubts)])))
@@ -56,9 +55,9 @@ def seen_share(building: Building, room: int) -> float:
     return 1.0 - unseen / total if total else 0.0
 
 
-def _doubts(building: Building, room: int) -> F64:
-    """Return change and probability (n, 2) of the doubts about a room."""
-    return np.asarray(building.doubts[building.doubts[:, 0] == room, 1:], np.float64)
+def _doubts(building: Building, rooms: tuple[int, ...]) -> F64:
+    """Return change and probability (n, 2) of the doubts about rooms."""
+    return np.asarray(building.doubts[np.isin(building.doubts[:, 0], rooms), 1:], np.float64)
 
 
 def _quantile(weights: F64, shifts: F64, sigma: float, share: float) -> float:

@@ -62,6 +62,12 @@ def quad(building: Building, wall: int, a: float, b: float) -> F64:
     return np.array([start + a * along, start + b * along, start + b * along + back, start + a * along + back])
 
 
+def extent(building: Building) -> tuple[F64, F64]:
+    """Return the least and the greatest corner (2,) of rooms and faces of walls."""
+    points = np.concatenate([building.corners_m, building.walls_m.reshape(-1, 2)])
+    return (points.min(axis=0), points.max(axis=0)) if len(points) else (np.zeros(2), np.array([3.0, 1.0]))
+
+
 def rooms_on(building: Building, storey: int) -> list[int]:
     """Return the rooms of a storey."""
     return [k for k in range(len(building.areas_m2)) if building.room_storeys[k] == storey]
@@ -122,22 +128,23 @@ def _is_door(building: Building, opening: int) -> bool:
     return OPENING_KINDS[building.opening_kinds[opening]] == "door"
 
 
-WIDE = 2.0  # times as wide as high is a label
-
-
-def label_place(building: Building, room: int) -> F64:
-    """Return a place (2,) well inside a room and beside the swings of its doors, for its name."""
+def box_place(free: Any, wide: float, high: float) -> F64 | None:
+    """Return the middle (2,) of a box within a region where it is about as far from the outline as it can be (the pole of inaccessibility), of all
+    such places that nearest to the region's centroid; None where no box fits."""
     import shapely
-    from shapely.affinity import scale
 
-    rings = rings_of(building, room)
-    polygon = shapely.make_valid(shapely.Polygon(rings[0], rings[1:]))
-    swings = [shapely.Polygon(door_swing(building, door)) for door in doors_on(building, int(building.room_storeys[room]))]
-    for free in (shapely.difference(polygon, shapely.union_all(swings)), polygon):
-        if not free.is_empty and free.area > 0.0:
-            place = shapely.maximum_inscribed_circle(scale(free, 1.0 / WIDE, 1.0, origin=(0.0, 0.0)), 0.05).coords[0]
-            return np.array(place) * [WIDE, 1.0]
-    return np.asarray(rings[0].mean(axis=0), np.float64)
+    corners = np.array([[-wide, -high], [wide, -high], [wide, high], [-wide, high]]) / 2.0
+    rings = [ring for part in getattr(free, "geoms", [free]) if part.geom_type == "Polygon" for ring in (part.exterior, *part.interiors)]
+    swept = [shapely.MultiPoint(np.concatenate([corners + p, corners + q])).convex_hull for ring in rings for p, q in pairwise(ring.coords)]
+    middles = shapely.difference(free, shapely.union_all(swept))
+    if middles.is_empty or middles.area < 1e-9:
+        return None
+    radius = shapely.maximum_inscribed_circle(middles, 0.01 * high).length
+    _, place = shapely.shortest_line(free.centroid, middles.buffer(-LEEWAY * radius)).coords
+    return np.array(place)
+
+
+LEEWAY = 0.9  # of the greatest distance from the outline, that is enough
 
 
 # In 3D.

@@ -1,7 +1,8 @@
 """The building as IFC4, by ifcopenshell: project, site, building, storeys, walls with thickness, slabs, openings and spaces; metres.
 
 Slabs and the thickness of walls whose other face was not seen are nominal, and a property of each states it. An opening is a void in its wall:
-whether a leaf or a pane hangs in it was not measured."""
+whether a leaf or a pane hangs in it was not measured. Nor was whether a wall is external (there is no Pset_WallCommon), nor what walls and slabs are
+of: their material is named unknown."""
 
 from __future__ import annotations
 
@@ -16,7 +17,7 @@ from trihedron.pipeline.core.files import new_file
 from trihedron.pipeline.core.libraries import imports_of
 from trihedron.pipeline.core.linalg import norm
 from trihedron.pipeline.core.plan_areas import area_interval, area_sigma, seen_share
-from trihedron.pipeline.core.types import F64, Building
+from trihedron.pipeline.core.types import ELEMENTS, F64, SUPPORTS, Building
 from trihedron.plugins.building.geometry import SHEET_M, rings_of, rooms_on, storey_levels
 from trihedron.plugins.building.labels import label_of, use_of
 
@@ -47,6 +48,7 @@ class _IfcWriter:
         import ifcopenshell.api.context
         import ifcopenshell.api.feature
         import ifcopenshell.api.geometry
+        import ifcopenshell.api.material
         import ifcopenshell.api.project
         import ifcopenshell.api.pset
         import ifcopenshell.api.root
@@ -62,6 +64,9 @@ class _IfcWriter:
         model = self.api.context.add_context(self.file, context_type="Model")
         view = {"context_identifier": "Body", "target_view": "MODEL_VIEW", "parent": model}
         self.body = self.api.context.add_context(self.file, context_type="Model", **view)
+        plan = self.api.context.add_context(self.file, context_type="Plan")
+        view = {"context_identifier": "Axis", "target_view": "GRAPH_VIEW", "parent": plan}
+        self.axis = self.api.context.add_context(self.file, context_type="Plan", **view)
 
     def write(self, path: Path) -> None:
         """Make all elements and write them."""
@@ -73,6 +78,7 @@ class _IfcWriter:
         walls = [self._wall(k, storeys[self.building.wall_storeys[k]]) for k in range(len(self.building.walls_m))]
         for k, wall in enumerate(self.building.opening_walls):
             self._opening(k, walls[wall])
+        self._material([*walls, *self.file.by_type("IfcSlab")])
         for number, root in enumerate(self.file.by_type("IfcRoot")):
             root.GlobalId = self._guid(number)
         with new_file(path) as new:
@@ -102,6 +108,22 @@ class _IfcWriter:
         shape = self.shapes.get_representation(self.body, [self.shapes.extrude(profile, magnitude=float(height))])
         self.api.geometry.assign_representation(self.file, product=element, representation=shape)
 
+    def _axis(self, wall: Any, length: float, depth: float) -> None:
+        """Give a wall its centre line, in its own frame."""
+        curve = self.shapes.polyline([(0.0, -depth / 2.0), (length, -depth / 2.0)])
+        self.api.geometry.assign_representation(self.file, product=wall, representation=self.shapes.get_representation(self.axis, [curve]))
+
+    def _material(self, products: list[Any]) -> None:
+        """Say of elements that what they are of is not known."""
+        if products:
+            unknown = self.api.material.add_material(self.file, name="unknown")
+            self.api.material.assign_material(self.file, products=products, type="IfcMaterial", material=unknown)
+
+    def _evidence(self, kind: str, number: int) -> dict[str, int]:
+        """Return how many keyframes and frames an element rests on."""
+        rows = self.building.support[(self.building.support[:, 0] == ELEMENTS.index(kind)) & (self.building.support[:, 1] == number)]
+        return {f"{name.capitalize()}s": int((rows[:, 2] == SUPPORTS.index(name)).sum()) for name in ("keyframe", "frame")}
+
     def _properties(self, element: Any, **values: Any) -> None:
         known = {name: value for name, value in values.items() if not isinstance(value, float) or np.isfinite(value)}
         self.api.pset.edit_pset(self.file, pset=self.api.pset.add_pset(self.file, product=element, name=PROPERTIES), properties=known)
@@ -115,7 +137,8 @@ class _IfcWriter:
         seen = np.isfinite(self.building.storeys[k])
         floor_sigma, ceiling_sigma = (float(value) for value in np.sqrt(np.diag(self.building.storey_covariance[k])))
         self._properties(
-            storey, FloorMeasured=bool(seen[0]), CeilingMeasured=bool(seen[1]), FloorSigma=floor_sigma, CeilingSigma=ceiling_sigma
+            storey, FloorMeasured=bool(seen[0]), CeilingMeasured=bool(seen[1]), FloorSigma=floor_sigma, CeilingSigma=ceiling_sigma,
+            **self._evidence("storey", k),
         )  # fmt: skip
         for room in rooms_on(self.building, k):
             self._space(room, storey, low, high)
@@ -143,6 +166,7 @@ class _IfcWriter:
             AreaHigh=high_m2,
             SeenShare=seen_share(self.building, room),
             SeenAllRound=bool(self.building.closed[room]),
+            **self._evidence("room", room),
         )
 
     def _slab(self, room: int, storey: Any, k: int, kind: str, height: float) -> None:
@@ -165,10 +189,12 @@ class _IfcWriter:
         wall = self._entity("IfcWall", label_of(self.building, "wall", k))
         self.api.spatial.assign_container(self.file, products=[wall], relating_structure=storey)
         self._place(wall, np.array([*start, low]), (end - start) / max(length, 1e-9))
+        self._axis(wall, length, depth)
         self._solid(wall, [np.array([[0.0, -depth], [length, -depth], [length, 0.0], [0.0, 0.0]])], high - low)
-        offset, deep, _ = (float(value) for value in np.sqrt(np.diag(self.building.wall_covariance[k])))
+        offset, deep, turned = (float(value) for value in np.sqrt(np.diag(self.building.wall_covariance[k])))
         unseen = sum(float(row[2] - row[1]) for row in self.building.unseen if int(row[0]) == k)
-        self._properties(wall, ThicknessMeasured=measured, OffsetSigma=offset, ThicknessSigma=deep, UnseenLength=unseen)
+        sigmas = {"OffsetSigma": offset, "ThicknessSigma": deep, "DirectionSigma": turned}
+        self._properties(wall, ThicknessMeasured=measured, UnseenLength=unseen, **sigmas, **self._evidence("wall", k))
         return wall
 
     def _opening(self, k: int, wall: Any) -> None:
@@ -185,4 +211,5 @@ class _IfcWriter:
         self._place(opening, np.array([*corner, low + bottom]), along)
         self._solid(opening, [np.array([[0.0, -depth], [right - left, -depth], [right - left, 0.0], [0.0, 0.0]])], top - bottom)
         sides = np.sqrt(np.diag(self.building.opening_covariance[k]))
-        self._properties(opening, LeftSigma=float(sides[0]), RightSigma=float(sides[1]), BottomSigma=float(sides[2]), TopSigma=float(sides[3]))
+        sigmas = {f"{side}Sigma": float(sigma) for side, sigma in zip(("Left", "Right", "Bottom", "Top"), sides)}
+        self._properties(opening, **sigmas, **self._evidence("opening", k))

@@ -11,10 +11,12 @@ import numpy as np
 
 from trihedron.pipeline.core.errors import DataError, printable
 from trihedron.pipeline.core.files import SHOWN
+from trihedron.pipeline.core.plan_areas import area_interval, area_sigma
 from trihedron.pipeline.core.types import OPENING_KINDS, Building
 
 LISTS = {"wall": "walls", "room": "rooms", "opening": "openings"}  # element -> its list in building.json
 LONGEST_NAME, FARTHEST_M, MOST = 200, 1e6, 10_000  # characters, coordinates and elements of a file that are read
+LOPSIDED = 0.2  # of an interval, by which its middle is off the area, from which a plan has both ends
 CURE = "correct it, or give a building.json that trihedron wrote"
 
 Place = tuple[float, float]
@@ -161,3 +163,12 @@ def id_of(building: Building, element: str, number: int) -> str:
 def label_of(building: Building, element: str, number: int) -> str:
     """Return the name of an element, else its kind and number."""
     return name_of(building, element, number) or f"{kind_of(building, element, number)} {number}"
+
+
+def area_text(building: Building, room: int) -> str:
+    """Return the area of a room: with its standard deviation where that tells all, else with its 95 % interval; "seen" where its walls were not seen
+    all round."""
+    area, sigma, (low, high) = float(building.areas_m2[room]), area_sigma(building, room), area_interval(building, room)
+    if building.closed[room] and abs(low + high - 2.0 * area) < LOPSIDED * (high - low):
+        return f"{area:.2f} ± {sigma:.2f} m²"
+    return f"{area:.2f} m²{'' if building.closed[room] else ' seen'} ({low:.1f} to {high:.1f})"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -263,11 +263,12 @@ class Building:
 
         return self._write(path, write_json)
 
-    def to_svg(self, path: str | Path) -> Path:
+    def to_svg(self, path: str | Path, name: str = "") -> Path:
         """Write the floor plan as SVG.
 
         Args:
             path: the file; it is overwritten.
+            name: what the title says that it is a plan of.
 
         Returns:
             The path.
@@ -275,9 +276,27 @@ class Building:
         Raises:
             DataError: the file cannot be written.
         """
-        from trihedron.plugins.building.files import write_svg
+        from trihedron.plugins.building.svg import write_svg
 
-        return self._write(path, write_svg)
+        return self._write(path, partial(write_svg, name=name))
+
+    def to_pdf(self, path: str | Path, name: str = "") -> Path:
+        """Write the floor plan as PDF, to scale.
+
+        Args:
+            path: the file; it is overwritten.
+            name: what the title says that it is a plan of.
+
+        Returns:
+            The path.
+
+        Raises:
+            DataError: the file cannot be written.
+            LibraryError: matplotlib is not installed.
+        """
+        from trihedron.plugins.building.pdf import write_pdf
+
+        return self._write(path, partial(write_pdf, name=name))
 
     def to_dxf(self, path: str | Path) -> Path:
         """Write the floor plan as DXF.
@@ -291,7 +310,7 @@ class Building:
         Raises:
             DataError: the file cannot be written.
         """
-        from trihedron.plugins.building.files import write_dxf
+        from trihedron.plugins.building.dxf import write_dxf
 
         return self._write(path, write_dxf)
 
