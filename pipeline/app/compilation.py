@@ -45,7 +45,7 @@ BUILDING, LIVE = (*ROOM, "outputs=[trajectory,building]"), (*ROOM, "live=true")
 AGAIN = ("replay={folder}/0/run.mcap", "only=[surface]", "outputs=[trajectory,surface]")  # of the first run of a process
 WHEEL = ((DIRECTIONS, SURFACE), (ROOM, AGAIN, BUILDING, LIVE, *ALL[1]))  # and for a wheel: also buildings and replays
 PARTS = {"tracking": TRACKING, "all": ALL, "wheel": WHEEL}
-FUNCTIONS = {"tracking": 810, "all": 1090, "wheel": 1320}  # compiled by both processes, about
+FUNCTIONS = {"tracking": 810, "all": 1130, "wheel": 1320}  # compiled by both processes, about
 LATER = "of surfaces, loops, a loss and relocalisation"  # what `all` compiles after `tracking`
 NAMES = {"tracking": "of tracking", "all": f"of tracking, {LATER.removeprefix('of ')}", "wheel": "of all that a wheel brings"}
 SHORT = 150  # frames of a run that hardly closes a loop
