@@ -21,6 +21,7 @@ import trihedron as th
 
 WIDTH, HEIGHT, FPS = 640, 480, 30
 OAK_HEIGHT = 400  # with WIDTH, a size that all cameras of an OAK-D have
+MAKERS = {"pyrealsense2": "pip install 'trihedron[realsense]'", "depthai": "pip install 'depthai>=3'"}  # the makers' libraries
 Images: TypeAlias = Iterator[tuple[Any, Any, float]]  # RGB, registered depth, seconds
 Source: TypeAlias = AbstractContextManager[tuple[Any, Images]]  # the camera, and its images for as long as it sends them
 
@@ -106,7 +107,7 @@ def track(source: Source, out: str, *words: str) -> None:
     """Track the images of a source, and write the run folder `out`."""
     with source as (camera, images), th.Slam(camera, *words, out=out, outputs=["trajectory", "surface", "building"]) as slam:
         count = show(slam, images)
-    print(f"{count} frames, {len(slam.mesh().triangles)} triangles, {len(slam.building().rooms)} rooms")
+    print(f"{count} frames, {len(slam.mesh().triangles)} triangles, rooms: {len(slam.building().rooms)}")
     print(f"surface {out}/surface.ply, floor plan {out}/floorplan.svg")
 
 
@@ -117,8 +118,17 @@ def main(source: str = "room", *words: str, out: str = "runs/camera") -> None:
         track(replay(th.dataset.synthetic(length=60) if source == "room" else th.dataset.folder(path=source)), out, *words)
 
 
-if __name__ == "__main__":
+def command(*words: str) -> None:
+    """Be the program: print its help, or one line for a mistake."""
+    if {"-h", "--help"} & set(words):
+        return print(__doc__)
     try:
-        main(*sys.argv[1:])
+        main(*words)
+    except ModuleNotFoundError as error:
+        sys.exit(f"camera_loop: {error.name}: is not installed; install it with: {MAKERS.get(error.name or '', f'pip install {error.name}')}")
     except (th.TrihedronError, ImportError) as error:
         sys.exit(f"camera_loop: {error}")
+
+
+if __name__ == "__main__":
+    command(*sys.argv[1:])

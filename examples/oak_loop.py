@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import sys
 
-from camera_loop import main
+from camera_loop import command
 
 if __name__ == "__main__":
-    main("oak", *sys.argv[1:])
+    command("oak", *sys.argv[1:])

@@ -52,6 +52,18 @@ def slam(camera):
         yield made
 
 
+@pytest.mark.parametrize("quiet", [False, True])
+def test_a_quiet_run_prints_nothing_on_a_terminal(tmp_path, capsys, monkeypatch, quiet):
+    for stream in (sys.stdout, sys.stderr):
+        monkeypatch.setattr(stream, "isatty", lambda: True)
+    first = th.run("outputs=[planes]", "planes=connected_components", dataset__length=3, out=tmp_path / "first", quiet=quiet)
+    printed = capsys.readouterr()
+    assert ("3/3" in printed.err, "run.mcap" in printed.out) == (not quiet, not quiet)
+    assert not quiet or printed.out + printed.err == ""
+    first.recording.replay(only=["planes"], planes={"angle_deg": 3})  # into no folder, and so without a word
+    assert "".join(capsys.readouterr()) == ""
+
+
 def test_importing_the_package_imports_nothing_else():
     """Neither NumPy nor any other library, so that a command that needs none starts at once."""
     program = "import sys; before = set(sys.modules); import trihedron; print(trihedron.__version__, *sorted(set(sys.modules) - before))"

@@ -60,7 +60,7 @@ def test_camera_loop_over_a_folder(tmp_path, capsys):
     example("camera_loop").main(str(room_folder(tmp_path / "mine")), "threads=1", out=str(out))
     first, counts, files = capsys.readouterr().out.splitlines()
     assert first == "   0.0 s  ok: first frame, origin of the world"
-    assert counts.startswith("12 frames, ") and int(counts.split()[2]) > 100 and counts.endswith(" rooms")
+    assert counts.startswith("12 frames, ") and int(counts.split()[2]) > 100 and ", rooms: " in counts
     assert files == f"surface {out}/surface.ply, floor plan {out}/floorplan.svg"
     assert (out / "surface.ply").stat().st_size > 1000 and (out / "floorplan.svg").read_text().startswith("<svg")
     assert [pose.status for pose in th.Recording(out).poses] == ["ok"] * 12
@@ -70,6 +70,30 @@ def test_camera_loop_names_what_is_wrong(tmp_path):
     words = [sys.executable, str(EXAMPLES / "camera_loop.py"), str(tmp_path / "nowhere")]
     done = subprocess.run(words, capture_output=True, text=True)
     assert done.returncode == 1 and done.stderr == f"camera_loop: {tmp_path}/nowhere: does not exist; give an existing folder as dataset.path\n"
+
+
+@pytest.mark.parametrize(
+    ("program", "words", "line"),
+    [
+        ("camera_loop", ["realsense"], "pyrealsense2: is not installed; install it with: pip install 'trihedron[realsense]'"),
+        ("camera_loop", ["oak"], "depthai: is not installed; install it with: pip install 'depthai>=3'"),
+        ("realsense_loop", [], "pyrealsense2: is not installed; install it with: pip install 'trihedron[realsense]'"),
+        ("oak_loop", [], "depthai: is not installed; install it with: pip install 'depthai>=3'"),
+    ],
+)
+def test_camera_loop_names_a_missing_library_and_its_cure(monkeypatch, program, words, line):
+    for library in ("pyrealsense2", "depthai"):
+        monkeypatch.setitem(sys.modules, library, None)
+    monkeypatch.setattr(sys, "path", [str(EXAMPLES), *sys.path])
+    monkeypatch.setattr(sys, "argv", [program, *words])
+    with pytest.raises(SystemExit) as caught:
+        runpy.run_path(str(EXAMPLES / f"{program}.py"), run_name="__main__")
+    assert str(caught.value) == f"camera_loop: {line}"
+
+
+def test_camera_loop_prints_its_help(capsys):
+    example("camera_loop").command("--help")
+    assert "python examples/camera_loop.py realsense " in capsys.readouterr().out
 
 
 FAR = Path(__file__).resolve().parents[2] / "shared" / "data" / "tum_fr3_structure_notexture_far"

@@ -11,7 +11,7 @@ ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = ROOT / "examples" / "gallery"
 PRINTED = {  # a pattern that the printed lines must match
     "a_covered_camera": r"ok 60, degraded 0, lost 15",
-    "a_floor_plan": r"1 storey, [2-9] walls, 1 rooms",
+    "a_floor_plan": r"storeys: 1, walls: [2-9], rooms: 1",
     "a_mesh_of_planes": r"\d{3,} triangles, [1-9]\d planes",
     "a_room_without_texture": r"graph=structural: 100 % tracked, ATE [0-9]\.\d mm",
     "a_tracked_room": r"90 of 90 frames ok, ATE [0-4]\.\d mm",

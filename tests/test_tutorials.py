@@ -1,6 +1,7 @@
 """Each tutorial is executed as printed: its files are written, its shell blocks run in order, in a new folder and an environment of their own.
 
-A block of code with a title is a file; a block `sh` is run; `console` and `text` are for reading (installation, and what is printed)."""
+A block of code with a title is a file; a block `sh` is run, and a block `text` right behind it holds lines that it prints; `console` and other blocks
+`text` are for reading (installation, mistakes)."""
 
 import os
 import re
@@ -14,6 +15,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 TUTORIALS = sorted((ROOT / "docs" / "tutorial").glob("*.md"))
 BLOCK = re.compile(r'^```(\w*)(?: title="([^"]+)")?\n(.*?)^```$', re.MULTILINE | re.DOTALL)
+TIMES = re.compile(r"\d ms\b")  # differ from run to run; all other figures are the same everywhere
 REPORTED = {  # lines that a tutorial's commands must print
     "first-run": ("frames: 60 ok", "Keypoints", "manhattan"),
     "own-recording": ("frames: 40 ok",),
@@ -29,6 +31,11 @@ REPORTED = {  # lines that a tutorial's commands must print
 def blocks(tutorial: Path) -> list[tuple[str, str, str]]:
     """Language, title and text of each block of code."""
     return BLOCK.findall(tutorial.read_text())
+
+
+def shown_lines(text: str, folder: Path) -> list[str]:
+    """The lines of a block that a command in a folder must print as they stand: all but those with times."""
+    return [line.replace("/home/you", str(folder)) for line in text.splitlines() if line.strip() != "..." and not TIMES.search(line)]
 
 
 @pytest.fixture(scope="session")
@@ -59,7 +66,7 @@ def test_every_tutorial_has_blocks_and_promises():
 def test_tutorial(tutorial, programs, tmp_path):
     environment = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "VIRTUAL_ENV")}
     environment |= {"PATH": f"{programs}:{environment['PATH']}", "PIP_NO_BUILD_ISOLATION": "0", "PIP_NO_DEPS": "1", "PIP_NO_INDEX": "1"}
-    printed = ""
+    printed, output, before = "", "", ""
     for language, title, text in blocks(tutorial):
         if title:
             path = tmp_path / title
@@ -68,6 +75,10 @@ def test_tutorial(tutorial, programs, tmp_path):
         elif language == "sh":
             done = subprocess.run(["bash", "-euo", "pipefail", "-c", text], cwd=tmp_path, env=environment, capture_output=True, text=True)
             assert done.returncode == 0, f"{text}\n{done.stdout[-2000:]}\n{done.stderr[-2000:]}"
-            printed += done.stdout + done.stderr
+            output = done.stdout + done.stderr
+            printed += output
+        elif language == "text" and before == "sh":
+            assert [line for line in shown_lines(text, tmp_path) if line not in output.splitlines()] == [], output[-4000:]
+        before = language
     for line in REPORTED[tutorial.stem]:
         assert line in printed, f"{line} is not in:\n{printed[-4000:]}"

@@ -23,6 +23,7 @@ from trihedron.tools.arguments import Parser
 
 RECORDING = "run.mcap"
 BY_ENDING = {"glb": "gltf", "rrd": "rerun"}  # endings of files that are given for the names of their formats
+OF_BUILDINGS = ("dxf", "ifc", "svg")  # formats of another command
 FLAGS = {"covariance": "with the covariance of each pose (tum)", "images": "in the colours of the images, not of the planes (png)"}
 
 
@@ -55,7 +56,8 @@ def main(argv: list[str]) -> int:
     arguments = parser.parse_args(argv)
     name = BY_ENDING.get(arguments.to, arguments.to)
     if name not in formats():
-        raise UsageError("export", f"there is no format '{name}'", did_you_mean(name, formats()))
+        plan = f"trihedron building {arguments.run} writes it" if name in OF_BUILDINGS else ""
+        raise UsageError("export", f"there is no format '{name}'", plan or did_you_mean(name, formats()))
     chosen = formats()[name]
     for flag in (flag for flag in FLAGS if vars(arguments)[flag]):
         if flag not in chosen.variants:

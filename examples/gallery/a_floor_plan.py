@@ -25,7 +25,7 @@ def main(out: Path) -> None:
         axes.plot(*ends.T, color="black", linewidth=3)
     axes.set(aspect="equal", xlabel="m", ylabel="m")
     figure.savefig(out, dpi=90)
-    print(f"{len(plan.storeys)} storey, {len(plan.walls_m)} walls, {len(plan.room_storeys)} rooms")
+    print(f"storeys: {len(plan.storeys)}, walls: {len(plan.walls_m)}, rooms: {len(plan.room_storeys)}")
 
 
 if __name__ == "__main__":

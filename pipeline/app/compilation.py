@@ -1,8 +1,8 @@
 """Compile the kernels of the default graph in two processes, before the first run or when `trihedron compile` is called.
 
 numba compiles one function at a time in a process, and knows the types of the arguments only from a call. So two processes run the graph on small
-images of the built-in room, one as far as the Manhattan frame, the other with points alone but to the end. What both need is compiled by the one that
-comes to it first, and loaded from the cache by the other. The runs that follow need all stages and compile what is left.
+images of the built-in room, one as far as the Manhattan frame, the other with points alone but to the end, then with all stages. What both need is
+compiled by the one that comes to it first, and loaded from the cache by the other.
 """
 
 from __future__ import annotations
@@ -28,20 +28,26 @@ from trihedron.pipeline.core.machine_code import BASELINE, archive, pack
 from trihedron.pipeline.run.warm_up import Progress, compilations
 
 SMALL = ("width=160", "height=120")
-ROOM = (*(f"dataset.{word}" for word in SMALL), "dataset.length=40")
+WHOLE = tuple(f"dataset.{word}" for word in SMALL)  # all frames of the room: some functions are called now and then
+ROOM = (*WHOLE, "dataset.length=40")
 LOST = ("dataset=faults", *(f"+dataset.options.{word}" for word in SMALL), "dataset.cover=10:20")
 DIRECTIONS = (*ROOM, "dataset.frames=0:5", "outputs=[manhattan]")
 POINTS = (*ROOM, "normals=none", "planes=none", "lines=none")
 SURFACE = (*ROOM, "outputs=[trajectory,surface]")
 FOUND, UNKNOWN = (*LOST, "dataset.frames=0:100"), (*LOST, "dataset.frames=0:60", "+dataset.options.texture=false")
-TRACKING = ((DIRECTIONS,), (POINTS,))  # runs of each process before a run, which compiles what is left as it comes to it
-TURN = (*(f"dataset.{word}" for word in SMALL), "dataset.length=300", "dataset.motion=pan")  # round which a loop is closed
-ALL = ((DIRECTIONS, SURFACE), (POINTS, FOUND, UNKNOWN, TURN))  # and before a live run: also what a surface, a loss, the way back and a loop need
+TRACKING = ((DIRECTIONS,), (POINTS, WHOLE))  # runs of each process before a run, which compiles what is left as it comes to it
+TURN = (*WHOLE, "dataset.length=300", "dataset.motion=pan")  # round which a loop is closed
+ALL = (
+    (DIRECTIONS, SURFACE),
+    (POINTS, WHOLE, FOUND, UNKNOWN, TURN),
+)  # and before a live run: also what a surface, a loss, the way back and a loop need
 BUILDING, LIVE = (*ROOM, "outputs=[trajectory,building]"), (*ROOM, "live=true")
 AGAIN = ("replay={folder}/0/run.mcap", "only=[surface]", "outputs=[trajectory,surface]")  # of the first run of a process
-WHEEL = ((DIRECTIONS, SURFACE), (ROOM, AGAIN, BUILDING, LIVE, POINTS, FOUND, UNKNOWN, TURN))  # and for a wheel: also buildings and replays
+WHEEL = ((DIRECTIONS, SURFACE), (ROOM, AGAIN, BUILDING, LIVE, *ALL[1]))  # and for a wheel: also buildings and replays
 PARTS = {"tracking": TRACKING, "all": ALL, "wheel": WHEEL}
-FUNCTIONS = {"tracking": 750, "all": 1090, "wheel": 1320}  # compiled by both processes, about
+FUNCTIONS = {"tracking": 810, "all": 1130, "wheel": 1320}  # compiled by both processes, about
+LATER = "of surfaces, loops, a loss and relocalisation"  # what `all` compiles after `tracking`
+NAMES = {"tracking": "of tracking", "all": f"of tracking, {LATER.removeprefix('of ')}", "wheel": "of all that a wheel brings"}
 SHORT = 150  # frames of a run that hardly closes a loop
 STAGES = {"keypoints", "lines", "planes", "manhattan"}  # of the graphs that these runs compile most of
 SWITCH = "TRIHEDRON_COMPILE"  # environment variable: with 0 a run compiles what it calls and nothing beforehand
@@ -53,15 +59,16 @@ def compile_kernels(what: str = "all") -> float:
     """Compile the default graph's kernels, `tracking` or `all` of them, with progress on standard error; returns seconds.
 
     Raises TrihedronError where a process fails."""
-    seconds = _compile(what)
+    there = FUNCTIONS["tracking"] if what == "all" and marker("tracking").exists() else 0
+    seconds = _compile(what, Progress(LATER if there else NAMES[what], FUNCTIONS[what] - there))
     marker(what).parent.mkdir(parents=True, exist_ok=True)
     marker(what).touch()
     return seconds
 
 
-def _compile(what: str, **variables: str) -> float:
+def _compile(what: str, progress: Progress, **variables: str) -> float:
     """Compile a part of PARTS in processes with these further environment variables; returns seconds. Raises TrihedronError."""
-    began, progress = time.perf_counter(), Progress(FUNCTIONS[what])
+    began = time.perf_counter()
     command = [sys.executable, "-m", __name__]
     environment = {**os.environ, SWITCH: "0", **variables}
     workers = [subprocess.Popen([*command, what, str(part)], stdout=subprocess.PIPE, env=environment) for part in range(len(PARTS[what]))]
@@ -102,7 +109,9 @@ def compile_once(stages: Sequence[str], frames: int | None) -> None:
 def compile_for_wheel(out: Path) -> float:
     """Compile what a wheel carries, for the baseline of `core.machine_code`, and write its archive; returns seconds. Raises TrihedronError."""
     with tempfile.TemporaryDirectory() as folder:
-        seconds = _compile("wheel", NUMBA_CPU_NAME=BASELINE, NUMBA_CPU_FEATURES="", NUMBA_CACHE_DIR=folder)
+        seconds = _compile(
+            "wheel", Progress(NAMES["wheel"], FUNCTIONS["wheel"]), NUMBA_CPU_NAME=BASELINE, NUMBA_CPU_FEATURES="", NUMBA_CACHE_DIR=folder
+        )
         pack(Path(folder) / cache_folder().name, out)
     return seconds
 

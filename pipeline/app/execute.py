@@ -251,11 +251,11 @@ def _commit() -> str:
 
 
 def _progress(steps: Iterator[Step]) -> Iterator[Step]:
-    """A bar with the frame rate on a terminal, a plain line every few seconds elsewhere."""
+    """A bar with the frame rate on a terminal, a plain line every few seconds on another standard output."""
     bar: Any = None
     began = printed = time.perf_counter()
     for step in steps:
-        if sys.stderr.isatty():
+        if sys.stderr.isatty() and sys.stdout.isatty():
             bar = bar or tqdm(total=step.count, unit="frame", dynamic_ncols=True)
             bar.update()
         elif time.perf_counter() - printed > PLAIN_PROGRESS_SECONDS:

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 from omegaconf import DictConfig
 
 from trihedron.pipeline.record.foxglove_server import FoxgloveServer
 from trihedron.pipeline.record.rerun_viewer import opened_rerun
+from trihedron.pipeline.run.interrupts import wait_for_the_end
 from trihedron.pipeline.run.rerun_sink import RerunSink
 
 PREVIEW_FRAMES = 60  # between two meshes that a viewer is shown
@@ -66,5 +66,4 @@ def opened_viewer(config: DictConfig) -> Iterator[Viewer]:
 def keep_serving(url: str, remark: str = "") -> None:
     """Wait until Ctrl-C or SIGTERM, the announced ways to end."""
     print(f"view: {url} is served until Ctrl-C or SIGTERM" + (f"; {remark}" if remark else ""), flush=True)
-    with suppress(KeyboardInterrupt):
-        threading.Event().wait()
+    wait_for_the_end()

@@ -8,6 +8,7 @@ import socket
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -57,9 +58,12 @@ def opened_rerun(host: str, port: int, web_port: int | None) -> Iterator[RerunVi
         stream.connect_grpc(address, default_blueprint=blueprint())
         yield RerunViewer(stream, f"http://{host}:{web_port}?url={quote(address, safe='')}" if web_port is not None else "")
     finally:
+        closing = threading.Thread(target=stream.disconnect, daemon=True)
+        closing.start()
+        closing.join(ENDING_S)  # to disconnect from a program that does not go on takes until that one has ended
         if process is not None and web_port is not None:
-            _end(process)  # first: to disconnect from one that does not go on would take forever
-        stream.disconnect()
+            _end(process)
+        closing.join()
 
 
 def _started(words: list[str], host: str, ports: list[int]) -> subprocess.Popen[bytes]:

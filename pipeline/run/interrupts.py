@@ -26,15 +26,27 @@ def interrupt(number: int, *_: Any) -> None:
 
 @contextmanager
 def ending_signals_interrupt() -> Iterator[None]:
-    """Within it SIGTERM and SIGHUP interrupt the program as SIGINT does. One that is ignored (nohup) or that others handle stays as it is."""
-    numbers = [number for number in ENDING[1:] if _on_main_thread() and signal.getsignal(number) is signal.SIG_DFL]
-    for number in numbers:
-        signal.signal(number, interrupt)
+    """Within it SIGTERM and SIGHUP interrupt the program as SIGINT does. One that is ignored (nohup) or that others handle stays as it is. Afterwards
+    all three are handled as before."""
+    before = {number: signal.getsignal(number) for number in ENDING if _on_main_thread() and signal.getsignal(number) is not None}
+    for number, handler in before.items():
+        if number != signal.SIGINT and handler is signal.SIG_DFL:
+            signal.signal(number, interrupt)
     try:
         yield
     finally:
-        for number in numbers:
-            signal.signal(number, signal.SIG_DFL)
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def wait_for_the_end() -> None:
+    """Return when a signal asks the program to end, as was announced. Further ones change nothing: what is left is to close (`timeout` and a second
+    Ctrl-C send two)."""
+    ended = threading.Event()
+    for number in ENDING if _on_main_thread() else ():
+        if signal.getsignal(number) in (signal.default_int_handler, interrupt):
+            signal.signal(number, lambda *_: ended.set())
+    ended.wait()
 
 
 class Interrupts:

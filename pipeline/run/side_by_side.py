@@ -22,6 +22,7 @@ from trihedron.pipeline.run.interrupts import Interrupts
 from trihedron.pipeline.run.node import Node, NodeFailure
 from trihedron.pipeline.run.runner import Runner
 from trihedron.pipeline.run.scheduler import Scheduler, single_threaded_libraries
+from trihedron.pipeline.run.warm_up import CompilerClock
 
 DATASET = "dataset"
 MAP = "map"  # what the end of a fold reads besides its wires
@@ -111,8 +112,8 @@ def users_of(classes: Sequence[Mapping[str, Class]]) -> dict[Class, list[int]]:
 
 
 class SideBySide:
-    """Replays of one recording that advance together, frame by frame. `cpu_s` has the CPU seconds of each node so far, `node_of` the node that
-    serves a stage of a runner, `users` how many runners a node serves."""
+    """Replays of one recording that advance together, frame by frame. `cpu_s` has the CPU seconds of each node so far, without those of the
+    compiler, `node_of` the node that serves a stage of a runner, `users` how many runners a node serves."""
 
     def __init__(self, runners: Sequence[Runner], threads: int) -> None:
         self.runners, self.threads = runners, threads
@@ -122,6 +123,7 @@ class SideBySide:
         self.node_of: list[dict[str, str]] = []
         self._owner: dict[str, tuple[int, str]] = {}  # node -> the runner that computes it, and the stage
         self._calls: dict[str, dict[int, float]] = defaultdict(dict)
+        self._compiler = CompilerClock()
         for number, (runner, nodes, numbers) in enumerate(zip(runners, own, classes)):
             self.node_of.append({name: f"{name}:{number if self._fold(runner, name) else ''}{numbers[name]}" for name in nodes})
             for name, node in self.node_of[-1].items():
@@ -154,13 +156,13 @@ class SideBySide:
         return np.array([1e3 * sum(self._calls[node].get(position, 0.0) for node in nodes) for position in range(self.count)])
 
     def _timed_node(self, name: str, number: int, stage: str, own: Sequence[Mapping[str, Node]]) -> Node:
-        """The node of a runner under its common name, with its CPU time measured."""
+        """The node of a runner under its common name, with its CPU time measured, but for what is compiled once."""
         node, names, seconds = own[number][stage], self.node_of[number], self._calls[name]
 
         def call(position: int, inputs: Mapping[str, Any]) -> Any:
-            began = time.thread_time()
+            began, compiling = time.thread_time(), self._compiler.seconds()
             value = node.call(position, inputs)
-            seconds[position] = time.thread_time() - began
+            seconds[position] = time.thread_time() - began - (self._compiler.seconds() - compiling)
             return value
 
         return replace(node, name=name, call=call, inputs={p: Wire(names[wire.topic], wire.delay) for p, wire in node.inputs.items()})
@@ -172,7 +174,7 @@ class SideBySide:
         recent = {node: before[k][name] for node, (k, name) in self._owner.items() if name in before[k]}
         scheduler = Scheduler(self._nodes, self.threads, self.threads, held, recent)
         try:
-            with single_threaded_libraries(), Interrupts() as interrupts:
+            with single_threaded_libraries(), self._compiler, Interrupts() as interrupts:
                 for position, values in scheduler.run(self.count):
                     each = [{name: values[node] for name, node in nodes.items() if node in values} for nodes in self.node_of]
                     with interrupts.defer():

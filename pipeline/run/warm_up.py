@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -19,7 +20,8 @@ from trihedron.pipeline.run.runner import Runner
 
 EVENTS: Any = event  # documented in numba's Event API, without types
 WARM_UP_FRAMES = 3  # enough for every stage to have been called
-COMPILING = "compiling functions for this machine, once"
+COMPILING = "compiling functions {}, for this machine, once"
+NEW = "called for the first time"  # what no compilation beforehand comes to: a plugin's own, types of arguments that only some data has
 PLAIN_SECONDS = 10.0  # between two lines where standard error is no terminal
 
 
@@ -31,8 +33,9 @@ def shows_bars() -> bool:
 class Progress:
     """Progress of compilation on standard error: a bar on a terminal, else a line every few seconds. Nothing is printed before the first function."""
 
-    def __init__(self, total: int | None = None) -> None:
-        self.count, self._total = 0, total
+    def __init__(self, what: str = NEW, total: int | None = None) -> None:
+        """`what` says which functions are compiled, `total` how many, about."""
+        self.count, self._total, self._message = 0, total, COMPILING.format(what)
         self._bar: tqdm[None] | None = None
         self._began = self._printed = 0.0
 
@@ -42,7 +45,7 @@ class Progress:
         now = time.perf_counter()
         if self.count == 1:
             because = f" ({why_unused()})" if carried() and why_unused() else ""
-            print(f"{COMPILING}{because} ...", file=sys.stderr, flush=True)
+            print(f"{self._message}{because} ...", file=sys.stderr, flush=True)
             self._began = self._printed = now
             self._bar = tqdm(total=self._total, unit="function", leave=False) if shows_bars() else None
         if self._bar is not None:
@@ -51,7 +54,7 @@ class Progress:
         elif now - self._printed > PLAIN_SECONDS:
             self._printed = now
             of = "" if self._total is None else f" of about {max(self._total, self.count)}"
-            print(f"{COMPILING}: {self.count}{of} after {now - self._began:.0f} s", file=sys.stderr, flush=True)
+            print(f"{self._message}: {self.count}{of} after {now - self._began:.0f} s", file=sys.stderr, flush=True)
 
     def close(self) -> None:
         """Remove the bar."""
@@ -71,6 +74,36 @@ class _Compiled(event.Listener):
     def on_end(self, event: event.Event) -> None:
         """Count it."""
         self._update()
+
+
+class CompilerClock(event.Listener):
+    """CPU seconds that numba's compiler has taken so far in each thread, within the context."""
+
+    def __init__(self) -> None:
+        self._own = threading.local()
+
+    def __enter__(self) -> CompilerClock:
+        EVENTS.register("numba:compile", self)
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
+        EVENTS.unregister("numba:compile", self)
+
+    def seconds(self) -> float:
+        """Return those of the thread that asks."""
+        return float(getattr(self._own, "seconds", 0.0))
+
+    def on_start(self, event: event.Event) -> None:
+        """A function, or one that it calls: those are compiled within it."""
+        self._own.depth = getattr(self._own, "depth", 0) + 1
+        if self._own.depth == 1:
+            self._own.began = time.thread_time()
+
+    def on_end(self, event: event.Event) -> None:
+        """The outermost counts."""
+        self._own.depth -= 1
+        if self._own.depth == 0:
+            self._own.seconds = self.seconds() + time.thread_time() - self._own.began
 
 
 class compilations:

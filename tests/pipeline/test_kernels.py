@@ -22,7 +22,7 @@ MODULES = [path for folder in ("pipeline", "plugins", "datasets", "tools") for p
 PUBLIC = {"numba", "numba.types", "numba.typed", "numba.extending", "numba.core.event"}  # as numba's documentation lists them
 RUN = [sys.executable, "-c", "import sys; from trihedron.pipeline.app.cli import main; sys.exit(main(sys.argv[1:]))", "run"]
 SMALL = ["dataset.width=160", "dataset.height=120", "dataset.frames=0:2", "outputs=[keypoints]"]
-COMPILES = "compiling functions for this machine, once"
+COMPILES = "for this machine, once"
 
 
 def numba_names(tree):
@@ -115,7 +115,8 @@ def test_what_is_compiled_is_counted_and_reported_in_plain_lines(capsys, monkeyp
     half = numba.njit(lambda x: 0.5 * x)
     with warm_up.compilation_reported():
         assert half(3.0) == 1.5 and half(5.0) == 2.5
-    assert capsys.readouterr().err == f"{COMPILES} ...\n{COMPILES}: 1 after 0 s\n"
+    line = "compiling functions called for the first time, for this machine, once"
+    assert capsys.readouterr().err == f"{line} ...\n{line}: 1 after 0 s\n"
     with warm_up.compilation_reported():
         assert half(7.0) == 3.5
     assert capsys.readouterr().err == ""
@@ -123,7 +124,7 @@ def test_what_is_compiled_is_counted_and_reported_in_plain_lines(capsys, monkeyp
 
 def test_the_total_of_the_progress_is_never_less_than_what_is_done(capsys, monkeypatch):
     monkeypatch.setattr(warm_up, "PLAIN_SECONDS", -1.0)
-    progress = warm_up.Progress(2)
+    progress = warm_up.Progress("of tracking", 2)
     for _ in range(3):
         progress.update()
     assert re.findall(r": (\d of about \d)", capsys.readouterr().err) == ["1 of about 2", "2 of about 2", "3 of about 3"]
@@ -157,6 +158,30 @@ def test_nothing_is_compiled_beforehand_twice_for_other_graphs_or_where_it_is_sw
     assert compiled == []
 
 
+@pytest.fixture
+def worker(tmp_path, monkeypatch):
+    """Processes of `compile_kernels` that print a line each, as for one function, with an empty cache."""
+    monkeypatch.setattr(kernels.CONFIG, "CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.setattr(compilation.sys, "executable", "echo")
+
+
+def test_the_line_says_what_is_compiled(worker, monkeypatch, capsys):
+    monkeypatch.setattr(warm_up, "PLAIN_SECONDS", -1.0)
+    compilation.compile_kernels("tracking")
+    printed = capsys.readouterr().err.splitlines()
+    assert printed[0] == "compiling functions of tracking, for this machine, once ..." and "1 of about 810 after" in printed[1]
+    compilation.compile_kernels()
+    printed = capsys.readouterr().err.splitlines()
+    assert printed[0] == "compiling functions of surfaces, loops, a loss and relocalisation, for this machine, once ..."
+    assert "1 of about 320 after" in printed[1]
+
+
+def test_all_is_compiled_at_once_where_nothing_was_before(worker, capsys):
+    compilation.compile_kernels()
+    expected = "compiling functions of tracking, surfaces, loops, a loss and relocalisation, for this machine, once ...\n"
+    assert capsys.readouterr().err == expected
+
+
 def test_a_failed_process_is_an_error_and_leaves_no_marker(tmp_path, monkeypatch):
     monkeypatch.setattr(kernels.CONFIG, "CACHE_DIR", str(tmp_path / "cache"))
     monkeypatch.setattr(compilation.sys, "executable", "false")
@@ -188,6 +213,6 @@ def test_a_second_start_loads_what_the_first_compiled(tmp_path):
 def test_a_run_after_compiling_ahead_compiles_nothing(tmp_path):
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
     subprocess.run([*RUN[:-1], "compile"], env=environment, check=True, cwd=tmp_path)
-    for number, words in enumerate([compilation.SURFACE, compilation.FOUND, compilation.UNKNOWN, compilation.TURN]):
+    for number, words in enumerate([compilation.WHOLE, compilation.SURFACE, compilation.FOUND, compilation.UNKNOWN, compilation.TURN]):
         done = subprocess.run([*RUN, *words, f"out={tmp_path / str(number)}"], env=environment, capture_output=True, text=True, cwd=tmp_path)
         assert done.returncode == 0 and COMPILES not in done.stderr

@@ -1,10 +1,13 @@
 """Graphs side by side: which stages change, what is shared, and the same bytes as alone."""
 
 import sys
+import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar
 
+import numba
+import numpy as np
 import pytest
 
 from trihedron.pipeline.core.errors import StageError
@@ -30,6 +33,20 @@ class CountedNormals(ToyNormals):
     def __call__(self, frame):
         self.calls.append(frame.index)
         return super().__call__(frame)
+
+
+@dataclass(frozen=True)
+class CompiledKeypoints(ToyKeypoints):
+    """Key points of a plugin that calls a function which is compiled in the last frame only; it measures the CPU time of its calls."""
+
+    seconds: ClassVar[list[float]] = []
+
+    def __call__(self, frame, rng):
+        began = time.thread_time()
+        if frame.index == 11:
+            numba.njit(lambda values: np.sort(values) + values.std())(np.ones(3))
+        self.seconds.append(time.thread_time() - began)
+        return super().__call__(frame, rng)
 
 
 @dataclass(frozen=True)
@@ -97,6 +114,14 @@ def test_side_by_side_gives_the_bytes_of_each_alone(tmp_path, threads, feedback)
     if not feedback:
         whole = contents(record(tmp_path / "whole.mcap", graphs[2]))
         assert all(contents(tmp_path / "2.mcap")[f"/{topic}"] == whole[f"/{topic}"] for topic in only)
+
+
+def test_the_time_of_a_swap_is_without_that_of_the_compiler(tmp_path):
+    source = record(tmp_path / "source.mcap", toy_graph())
+    together = SideBySide([Runner(toy_graph(keypoints=CompiledKeypoints()), replay=Replay(Recording(source), ("keypoints",)))], threads=2)
+    assert [index for index, _ in together.steps()] == list(range(12))
+    ms = together.cpu_ms_of_frames([together.node_of[0]["keypoints"]])
+    assert 0 < ms[11] < 0.5 * 1e3 * CompiledKeypoints.seconds[-1]
 
 
 @pytest.mark.parametrize("wire", ["rotation@prev", "rotation@3"])

@@ -33,6 +33,7 @@ from trihedron.pipeline.record import rerun_viewer
 from trihedron.pipeline.record.foxglove_server import FoxgloveServer
 from trihedron.pipeline.record.rerun_viewer import RerunViewer
 from trihedron.pipeline.record.writer import RecordingWriter
+from trihedron.pipeline.run.interrupts import ending_signals_interrupt, wait_for_the_end
 from trihedron.pipeline.run.rerun_sink import WAITING, RerunSink
 from trihedron.pipeline.run.runner import Runner
 from trihedron.pipeline.run.sinks import MemorySink
@@ -304,6 +305,7 @@ class Kept:
         command = [sys.executable, "-c", listen + "from trihedron.pipeline.app.cli import main; sys.exit(main())", *words]
         self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
         self.printed: list[str] = []
+        self.errors = ""
         assert self.process.stdout is not None
         while "is served until" not in (line := self.process.stdout.readline()):
             assert line, self.process.communicate()[1]
@@ -313,7 +315,7 @@ class Kept:
     def end(self, number: int) -> int:
         """Send the signal; return the exit code."""
         self.process.send_signal(number)
-        self.process.communicate(timeout=60)
+        self.errors = self.process.communicate(timeout=60)[1]
         return self.process.returncode
 
 
@@ -331,10 +333,25 @@ def test_a_foxglove_server_stays_with_what_was_last_shown(number: int, tmp_path:
                 break
             time.sleep(0.1)
         assert {topic for topic, _, _ in late.messages} == shown
-        assert kept.end(number) == 0
+        assert (kept.end(number), kept.errors) == (0, "")
         late.closed()
     finally:
         kept.process.kill()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_the_announced_end_is_no_interruption_however_often_it_is_asked_for(number: int) -> None:
+    usual = signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL
+    before = signal.signal(number, usual)
+    try:
+        with ending_signals_interrupt():
+            threading.Timer(0.1, os.kill, (os.getpid(), number)).start()
+            wait_for_the_end()
+            for _ in range(3):
+                os.kill(os.getpid(), number)
+        assert signal.getsignal(number) == usual
+    finally:
+        signal.signal(number, before)
 
 
 def test_a_server_that_is_not_kept_ends_with_the_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -382,7 +399,7 @@ def test_rerun_is_served_to_this_machine_until_the_end(tmp_path: Path, capsys: p
                 socket.create_connection((other_address(), number), timeout=5).close()
         assert main(["run", "view=rerun", "view.web=true", *ports, f"out={tmp_path / 'none'}"]) == 1
         assert capsys.readouterr().err == f"trihedron: view.port: {port} is in use; give another view.port\n"
-        assert kept.end(signal.SIGTERM) == 0
+        assert (kept.end(signal.SIGTERM), kept.errors) == (0, "")
     finally:
         kept.process.kill()
     with pytest.raises(OSError):
@@ -391,7 +408,7 @@ def test_rerun_is_served_to_this_machine_until_the_end(tmp_path: Path, capsys: p
     try:
         assert kept.printed == [f"6 frames of {tmp_path / 'run' / 'run.mcap'}\n"]
         assert kept.line == f"view: {url} is served until Ctrl-C or SIGTERM\n"
-        assert b"rerun" in page(url).lower() and kept.end(signal.SIGINT) == 0
+        assert b"rerun" in page(url).lower() and (kept.end(signal.SIGINT), kept.errors) == (0, "")
     finally:
         kept.process.kill()
 

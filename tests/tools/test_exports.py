@@ -83,6 +83,9 @@ def test_colmap_models_read_back(run, capsys):
 def test_what_cannot_be_exported_is_one_line(run, tmp_path, monkeypatch, capsys):
     assert main(["export", str(run), "--to", "colmpa"]) == 2
     assert capsys.readouterr().err == "trihedron: export: there is no format 'colmpa'; did you mean 'colmap'?\n"
+    for name in ("ifc", "svg", "dxf"):
+        assert main(["export", str(run), "--to", name]) == 2
+        assert capsys.readouterr().err == f"trihedron: export: there is no format '{name}'; trihedron building {run} writes it\n"
     monkeypatch.setitem(sys.modules, "rerun", None)
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     for command in (["view", str(run)], ["export", str(run), "--to", "rerun", "--out", str(tmp_path / "a.rrd")]):

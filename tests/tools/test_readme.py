@@ -26,6 +26,12 @@ def test_the_commands_exist():
         assert used <= known, f"{page}: {used - known}"
 
 
+def test_an_extra_is_installed_in_one_way_that_keeps_a_clone_as_it_is():
+    commands = {command for page in PAGES for command in re.findall(r"pip install [^`\n]*'[\w.]*\[\w+\]'", page.read_text())}
+    assert len(commands) > 5
+    assert [command for command in commands if not command.startswith("pip install --constraint constraints.txt -e '.[")] == []
+
+
 def shown_commands():
     """Page and words of each command in a block `sh` or `console`, placeholders and other programs left out."""
     for page in PAGES:
