@@ -39,7 +39,7 @@ def refused(capsys, *words, code=1):
     return lines[0]
 
 
-PATHS = "give a folder, a .mcap or .bag file, or key=value (quote lists: 'only=[pose]')"
+PATHS = "give a folder, a .mcap, .bag or .r3d file, or key=value (quote lists: 'only=[pose]')"
 SEE = "see trihedron plugins"
 MISTAKES = [
     (["threads=abc"], 1, "trihedron: threads: Value 'abc' of type 'str' could not be converted to Integer; give a value of that type"),
