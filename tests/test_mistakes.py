@@ -5,7 +5,8 @@ import pytest
 from trihedron.pipeline.app.cli import main
 
 TYPE, SEE = "give a value of that type", "see trihedron plugins"
-NO_PATH = "is not key=value, and there is no such path in {here}; give a folder, a .mcap or .bag file, or key=value (quote lists: 'only=[pose]')"
+SOURCES = "give a folder, a .mcap, .bag or .r3d file"
+NO_PATH = f"is not key=value, and there is no such path in {{here}}; {SOURCES}, or key=value (quote lists: 'only=[pose]')"
 MCAP = "is not an MCAP file; give a file that trihedron run or another MCAP writer wrote"
 MISTAKES = [  # words of the command, exit code, what is said after "trihedron: "
     ("run threads=abc", 1, f"threads: Value 'abc' of type 'str' could not be converted to Integer; {TYPE}"),
@@ -61,6 +62,7 @@ MISTAKES = [  # words of the command, exit code, what is said after "trihedron: 
     ("run out=", 2, "out=: lacks a folder; write key=value, for example out=runs/mine"),
     ("run =3", 2, "=3: lacks a key; write key=value, for example out=runs/mine"),
     ("run a b", 2, f"a: {NO_PATH}"),
+    ("run walk.r3d", 2, f"walk.r3d: {NO_PATH}"),
     ("run dataset.path", 2, f"dataset.path: {NO_PATH}"),
     ("run --dry-run", 2, "--dry-run: is of a sweep, and this is one run; add -m to run once with each of several values"),
     ("run --verbose", 2, "--verbose: is not an option of run; known: -m, --multirun, --dry-run; everything else is key=value"),

@@ -1,12 +1,14 @@
 """Each tutorial is executed as printed: its files are written, its shell blocks run in order, in a new folder and an environment of their own.
 
 A block of code with a title is a file; a block `sh` is run, and a block `text` right behind it holds lines that it prints; `console` and other blocks
-`text` are for reading (installation, mistakes)."""
+`text` are for reading (installation, mistakes). A block that serves a viewer is ended by Ctrl-C, as its page says."""
 
 import os
 import re
+import signal
 import subprocess
 import sysconfig
+import tempfile
 import venv
 from pathlib import Path
 
@@ -24,7 +26,7 @@ REPORTED = {  # lines that a tutorial's commands must print
     "which-estimator": ("as recorded against manhattan=plane_svd: axes", "false axes %", "differs.png", "mean of 3 recordings"),
     "write-a-plugin": ("all is well", "ok"),
     "from-python": ("triangles", "planes in the last frame", "40 frames compared"),
-    "watch-it-live": ("ws://localhost:8765", "/manhattan"),
+    "watch-it-live": ("ws://127.0.0.1:8765", "/manhattan"),
 }
 
 
@@ -36,6 +38,23 @@ def blocks(tutorial: Path) -> list[tuple[str, str, str]]:
 def shown_lines(text: str, folder: Path) -> list[str]:
     """The lines of a block that a command in a folder must print as they stand: all but those with times."""
     return [line.replace("/home/you", str(folder)) for line in text.splitlines() if line.strip() != "..." and not TIMES.search(line)]
+
+
+def run_block(text: str, folder: Path, environment: dict[str, str]) -> tuple[int, str, str]:
+    """Exit code, standard output and standard error of a block of shell, to which Ctrl-C is sent when it says that it is served until then."""
+    before = signal.signal(signal.SIGINT, signal.SIG_DFL)  # a child ignores what its parent ignores, as in the background of a shell
+    command, printed = ["bash", "-euo", "pipefail", "-c", text], []
+    with tempfile.TemporaryFile("w+") as errors:
+        with subprocess.Popen(
+            command, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=errors, text=True, start_new_session=True
+        ) as process:
+            signal.signal(signal.SIGINT, before)
+            for line in process.stdout:
+                printed.append(line)
+                if "is served until Ctrl-C" in line:
+                    os.killpg(process.pid, signal.SIGINT)
+        errors.seek(0)
+        return process.returncode, "".join(printed), errors.read()
 
 
 @pytest.fixture(scope="session")
@@ -73,9 +92,9 @@ def test_tutorial(tutorial, programs, tmp_path):
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(text)
         elif language == "sh":
-            done = subprocess.run(["bash", "-euo", "pipefail", "-c", text], cwd=tmp_path, env=environment, capture_output=True, text=True)
-            assert done.returncode == 0, f"{text}\n{done.stdout[-2000:]}\n{done.stderr[-2000:]}"
-            output = done.stdout + done.stderr
+            code, out, errors = run_block(text, tmp_path, environment)
+            assert code == 0, f"{text}\n{out[-2000:]}\n{errors[-2000:]}"
+            output = out + errors
             printed += output
         elif language == "text" and before == "sh":
             assert [line for line in shown_lines(text, tmp_path) if line not in output.splitlines()] == [], output[-4000:]

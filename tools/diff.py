@@ -1,8 +1,8 @@
 """Compare two recordings value by value: the first topic, frame and field in which they differ, and by how much; then every topic that differs.
 
-Only frames and topics that both have are compared; a message names what one of them lacks. Exit code 0 when all of it is equal, bit for bit, 1 when
-not. With --tolerance real numbers are equal that differ by no more: |a - b| <= T max(1, |a|, |b|); every field that differs is listed with its
-largest such difference. Libraries of linear algebra round differently on other processors.
+Only frames and topics that both have are compared; without --topics a message names topics that one of them lacks. Exit code 0 when all of it is
+equal, bit for bit, 1 when not. With --tolerance real numbers are equal that differ by no more: |a - b| <= T max(1, |a|, |b|); every field that
+differs is listed with its largest such difference. Libraries of linear algebra round differently on other processors.
 
 Example: trihedron diff runs/a/run.mcap runs/b/run.mcap --topics pose,map
 Example: trihedron diff runs/a/run.mcap runs/b/run.mcap --tolerance 1e-6
@@ -38,11 +38,11 @@ def main(argv: list[str]) -> int:
         raise UsageError("--tolerance", f"{arguments.tolerance:g} is not a tolerance", "give a number from 0")
     a, b = Recording(arguments.a), Recording(arguments.b)
     topics, frames = _topics(a, b, arguments.topics), common_frames(a, b)
-    if arguments.tolerance is not None:
+    if not arguments.topics:
         _report_lacking(a, b)
+    if arguments.tolerance is not None:
         return _within(a, b, topics, frames, arguments.tolerance)
     found = [found for topic in topics if (found := difference(a, b, topic, frames)) is not None]
-    _report_lacking(a, b)
     if not found:
         print(f"equal: {len(frames)} frames ({frames[0]}..{frames[-1]}) of {', '.join(topics)}")
         return 0

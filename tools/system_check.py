@@ -41,7 +41,7 @@ OPEN3D_NEEDS = (  # the loader names only the first that is missing
 
 
 def main() -> int:
-    """Import each module in a process of its own; print one line for each that does not load.
+    """Import each module in a process of its own; print one line for each that does not load, or one that says that all do.
 
     Returns 0 when all load, 1 when a required one does not, 3 when only optional ones do not."""
     code = 0
@@ -50,6 +50,8 @@ def main() -> int:
         if problem:
             print(f"trihedron: {problem}" + ("" if module in REQUIRED else " (only the stages that use it need it)"), file=sys.stderr)
             code = 1 if module in REQUIRED else code or 3
+    if not code:
+        print(f"all libraries load: {', '.join((*REQUIRED, *OPTIONAL))}")
     return code
 
 

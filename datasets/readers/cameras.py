@@ -82,7 +82,7 @@ def choose_calibration(folder: Path, choice: str, default: str = "") -> Calibrat
     matching = (preset for preset, pattern in FOLDER_NAMES.items() if re.search(pattern, name))
     preset = next(matching, default)
     if not preset:
-        raise DataError(str(folder), f"has no {CAMERA_FILE} and its name speaks of no known camera", SHORT)
+        raise DataError(str(folder), f"has no {CAMERA_FILE}, and its name is not that of a data set whose camera is known", SHORT)
     return PRESETS[preset]
 
 

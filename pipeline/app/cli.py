@@ -239,14 +239,12 @@ def _list_names(names: Iterable[str], default: str) -> str:
 
 def _data_set(word: str) -> list[str]:
     """A word of run as overrides: a path chooses the data set, and prints which. Raises UsageError for a word that is neither."""
-    from trihedron.pipeline.core.layouts import BAG, RECORDING, data_set_words
+    from trihedron.pipeline.core.layouts import SOURCES, data_set_words
 
     words = data_set_words(word)
     if words == [word] and "=" not in word and not word.startswith(("-", "~", "+")):
         searched = "there is no such path" if Path(word).is_absolute() else f"there is no such path in {Path.cwd()}"
-        raise UsageError(
-            word, f"is not key=value, and {searched}", f"give a folder, a {RECORDING} or {BAG} file, or key=value (quote lists: 'only=[pose]')"
-        )
+        raise UsageError(word, f"is not key=value, and {searched}", f"give {SOURCES}, or key=value (quote lists: 'only=[pose]')")
     if words != [word]:
         print(*words, file=sys.stderr)
     return words

@@ -10,8 +10,10 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from functools import cache, partial
 from pathlib import Path
+from shutil import rmtree
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
@@ -81,8 +83,8 @@ def _execute(config: DictConfig, out: Path, overrides: list[str], began: float, 
     topics = recorded_topics(config, graph, replay)
     _announce(runner)
     trial = partial(Runner, graph, config.seed, config.threads, replay, frames, remembered)
-    compile_once(runner.computed, runner.count if runner.feed is None else None)
-    with lock_folder(out):
+    with _interruption_explained(runner, out), lock_folder(out):
+        compile_once(runner.computed, runner.count if runner.feed is None else None)
         write_configuration(out, config, overrides)
         with Warnings() as warnings, compilation_reported():
             warm_up(trial())
@@ -98,9 +100,6 @@ def _execute(config: DictConfig, out: Path, overrides: list[str], began: float, 
                     pass
                 if config.save_map:
                     save_map(Path(config.save_map).expanduser(), runner.state, metadata_of(config, overrides), source)
-            except KeyboardInterrupt as error:
-                error.add_note(_interruption_summary(runner, out))
-                raise
             finally:
                 with defer_interrupts():
                     if writer is not None:
@@ -125,10 +124,21 @@ def open_writer(
     return writer
 
 
-def _interruption_summary(runner: Runner, out: Path) -> str:
-    """Say what an interrupted run leaves behind."""
-    count = len(runner.result.stamps_ns)
-    return f"frames done: {count}, kept in {out}" if count else "no frame was done"
+@contextmanager
+def _interruption_explained(runner: Runner, out: Path) -> Iterator[None]:
+    """Say what a run leaves behind that is interrupted in this block. A folder that it made and that holds no frame is removed."""
+    is_new = not out.exists()
+    try:
+        yield
+    except KeyboardInterrupt as error:
+        if count := len(runner.result.stamps_ns):
+            error.add_note(f"frames done: {count}, kept in {out}")
+        elif is_new:
+            error.add_note(f"nothing was computed, and {out} is removed")
+            rmtree(out, ignore_errors=True)
+        else:
+            error.add_note(f"nothing was computed; {out} was there before and is kept")
+        raise
 
 
 def close_writer(writer: RecordingWriter) -> RecordingError | None:

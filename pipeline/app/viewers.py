@@ -65,5 +65,4 @@ def opened_viewer(config: DictConfig) -> Iterator[Viewer]:
 
 def keep_serving(url: str, remark: str = "") -> None:
     """Wait until Ctrl-C or SIGTERM, the announced ways to end."""
-    print(f"view: {url} is served until Ctrl-C or SIGTERM" + (f"; {remark}" if remark else ""), flush=True)
-    wait_for_the_end()
+    wait_for_the_end(f"view: {url} is served until Ctrl-C or SIGTERM" + (f"; {remark}" if remark else ""))

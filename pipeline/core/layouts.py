@@ -9,6 +9,7 @@ from trihedron.pipeline.core.errors import DataError
 RECORDING = ".mcap"
 BAG = ".bag"  # of a ROS 1 bag
 FILES = {RECORDING: "mcap", BAG: "mcap", ".r3d": "record3d"}  # ending of a file -> data set plugin
+SOURCES = "a folder, a {}, {} or {} file".format(*FILES)
 METADATA_FILE = "metadata.yaml"  # of a rosbag2 folder
 LAYOUTS = {  # data set plugin -> patterns: of each group one must be there
     "mcap": ((METADATA_FILE,),),
@@ -27,7 +28,7 @@ def layout_of(source: Path) -> str:
         return FILES[source.suffix]
     if not source.is_dir():
         cause = "is not a folder or a recording" if source.exists() else "does not exist"
-        raise DataError(str(source), cause, f"give the folder of a data set or a {RECORDING} file")
+        raise DataError(str(source), cause, f"give {SOURCES}")
     return next((name for name, groups in LAYOUTS.items() if all(any(_holds(source, pattern) for pattern in group) for group in groups)), "folder")
 
 

@@ -39,13 +39,14 @@ def ending_signals_interrupt() -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def wait_for_the_end() -> None:
-    """Return when a signal asks the program to end, as was announced. Further ones change nothing: what is left is to close (`timeout` and a second
-    Ctrl-C send two)."""
+def wait_for_the_end(announcement: str) -> None:
+    """Print how the program is ended, and return when a signal asks for that, however soon. Further ones change nothing: what is left is to close
+    (`timeout` and a second Ctrl-C send two)."""
     ended = threading.Event()
     for number in ENDING if _on_main_thread() else ():
         if signal.getsignal(number) in (signal.default_int_handler, interrupt):
             signal.signal(number, lambda *_: ended.set())
+    print(announcement, flush=True)
     ended.wait()
 
 

@@ -128,5 +128,5 @@ def test_a_camera_that_is_neither_file_nor_preset_is_one_line(tmp_path: Path) ->
 
 def test_an_office_of_ones_own_gets_no_published_camera(tmp_path: Path) -> None:
     (tmp_path / "my_office").mkdir()
-    with pytest.raises(DataError, match=r"has no camera\.yaml and its name speaks of no known camera"):
+    with pytest.raises(DataError, match=r"has no camera\.yaml, and its name is not that of a data set whose camera is known"):
         choose_calibration(tmp_path / "my_office", "")

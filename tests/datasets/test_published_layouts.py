@@ -81,7 +81,7 @@ def test_tamu_is_tum_without_truth(tum_folder: Path) -> None:
     with pytest.raises(DataError, match=r"depth.txt: is missing; it lists the depth images"):
         len(Tamu(str(tum_folder)))
     (tum_folder / "camera.yaml").unlink()
-    with pytest.raises(DataError, match=r"has no camera.yaml and its name speaks of no known camera"):
+    with pytest.raises(DataError, match=r"has no camera.yaml, and its name is not that of a data set whose camera is known"):
         len(Tamu(str(tum_folder)))
 
 

@@ -69,7 +69,7 @@ TUM: list[tuple[Change, str]] = [
      "{}/groundtruth.txt: holds no poses; give a file with a line 'stamp tx ty tz qx qy qz qw' for each pose"),
     (lambda f: (f / "groundtruth.txt").write_bytes(b"\xff\xfe\x00\x81"),
      "{}/groundtruth.txt: is not a text file; give a text file with one entry a line"),
-    (remove("camera.yaml"), "{}: has no camera.yaml and its name speaks of no known camera;"
+    (remove("camera.yaml"), "{}: has no camera.yaml, and its name is not that of a data set whose camera is known;"
      " give dataset.camera=tum_fr1, tum_fr2, tum_fr3, icl_nuim or a camera.yaml"),
     (image("depth/10.000000.png", (24, 32), np.uint8), "{}/depth/10.000000.png: has 8 bits a pixel where depth has 16;"
      " give 16-bit depth images (value = metres × depth_scale); a preview picture does not hold metres"),

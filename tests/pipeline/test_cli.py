@@ -40,7 +40,7 @@ def refused(capsys, *words, code=1):
     return lines[0]
 
 
-PATHS = "give a folder, a .mcap or .bag file, or key=value (quote lists: 'only=[pose]')"
+PATHS = "give a folder, a .mcap, .bag or .r3d file, or key=value (quote lists: 'only=[pose]')"
 SEE = "see trihedron plugins"
 MISTAKES = [
     (["threads=abc"], 1, "trihedron: threads: Value 'abc' of type 'str' could not be converted to Integer; give a value of that type"),
@@ -278,9 +278,12 @@ def test_a_signal_leaves_a_recording_and_a_trajectory(tmp_path, number, code):
 
 
 @pytest.mark.parametrize("number, code", [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
-def test_a_signal_before_the_first_frame_leaves_a_closed_recording(tmp_path, capsys, monkeypatch, number, code):
-    """The signal comes while the recording is being opened."""
-    attach = RecordingWriter.attach
+@pytest.mark.parametrize("is_new", [True, False])
+def test_a_signal_before_the_first_frame_leaves_no_empty_folder(tmp_path, capsys, monkeypatch, number, code, is_new):
+    """The signal comes while the recording is being opened. A folder that was there before is kept, with a recording that is closed."""
+    attach, out = RecordingWriter.attach, tmp_path / "early"
+    if not is_new:
+        out.mkdir()
 
     def interrupted(writer, name, text):
         attach(writer, name, text)
@@ -292,8 +295,21 @@ def test_a_signal_before_the_first_frame_leaves_a_closed_recording(tmp_path, cap
         assert main(["run", *SMALL, "out=early"]) == code
     finally:
         signal.signal(number, before)
-    assert capsys.readouterr().err.splitlines()[-1] == "trihedron: interrupted; no frame was done"
-    assert len(list(Recording(tmp_path / "early" / "run.mcap").values("pose"))) == 0
+    left = f"nothing was computed, and {out} is removed" if is_new else f"nothing was computed; {out} was there before and is kept"
+    assert capsys.readouterr().err.splitlines()[-1] == f"trihedron: interrupted; {left}"
+    assert out.exists() != is_new
+    if not is_new:
+        assert len(list(Recording(out / "run.mcap").values("pose"))) == 0
+
+
+def test_a_signal_while_kernels_are_compiled_says_that_nothing_was_computed(tmp_path, capsys, monkeypatch):
+    def interrupted(stages, frames):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("trihedron.pipeline.app.execute.compile_once", interrupted)
+    assert main(["run", *SMALL, "out=early"]) == 130
+    assert capsys.readouterr().err == f"trihedron: interrupted; nothing was computed, and {tmp_path}/early is removed\n"
+    assert not (tmp_path / "early").exists()
 
 
 @pytest.mark.slow

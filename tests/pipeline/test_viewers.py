@@ -346,12 +346,30 @@ def test_the_announced_end_is_no_interruption_however_often_it_is_asked_for(numb
     try:
         with ending_signals_interrupt():
             threading.Timer(0.1, os.kill, (os.getpid(), number)).start()
-            wait_for_the_end()
+            wait_for_the_end("served")
             for _ in range(3):
                 os.kill(os.getpid(), number)
         assert signal.getsignal(number) == usual
     finally:
         signal.signal(number, before)
+
+
+def test_the_announced_end_may_be_asked_for_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The signal comes while the line that announces it is printed."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    printed: list[str] = []
+
+    def write(text: str, flush: bool) -> None:
+        printed.append(text)
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr("builtins.print", write)
+    try:
+        with ending_signals_interrupt():
+            wait_for_the_end("served until Ctrl-C")
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert printed == ["served until Ctrl-C"]
 
 
 def test_a_server_that_is_not_kept_ends_with_the_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -298,6 +298,7 @@ def test_errors_of_a_stage_alone():
 def test_a_run_folder_of_an_ablation_is_a_recording(tmp_path):
     folder = tmp_path / "manhattan=plane_svd"
     folder.mkdir()
+    (folder / "run.mcap").touch()
     options = options_of([str(folder), "manhattan=mixture", f"out={tmp_path / 'o'}"])
     assert options.recordings == (folder / "run.mcap",) and options.swaps == ("manhattan=mixture",)
 
@@ -307,16 +308,17 @@ def test_a_run_folder_of_an_ablation_is_a_recording(tmp_path):
     [
         ("manhattan=plane_svd out=o", 2, "ablate: no recording is given; give RUN.mcap first"),
         ("run.mcap out=o", 2, "ablate: nothing is swapped; give STAGE=PLUGIN,PLUGIN or STAGE.OPTION=VALUE,VALUE"),
-        ("run.mcap manhattan=plane_svd", 2, "out: is not given; give out=DIR for the alternatives"),
-        ("run.mcap manhattan=plane_svd out=o feedback=recorder", 2, "feedback: is 'recorder'; did you mean 'recorded'?"),
-        ("run.mcap manhattan=plane_svd out=o threads=0", 1, "threads: 0 is not a number of threads; give 1 to 256"),
+        ("own.mcap manhattan=plane_svd", 2, "out: is not given; give out=DIR for the alternatives"),
+        ("own.mcap manhattan=plane_svd out=o feedback=recorder", 2, "feedback: is 'recorder'; did you mean 'recorded'?"),
+        ("own.mcap manhattan=plane_svd out=o threads=0", 1, "threads: 0 is not a number of threads; give 1 to 256"),
         ("a.mcap b.mcap bundle=none out=o --budget", 2, "--budget: is of one run, and 2 recordings are given; give one of them"),
         ("own.mcap manhatan=plane_svd out=o", 2, "manhatan: is not a stage, nor an option or a wire of one; did you mean 'manhattan'?"),
         ("own.mcap dataset.length=3 out=o", 2,
          "dataset.length: an ablation has the frames of its recordings; make a recording of the other frames, and give it too"),
         ("own.mcap planes.angle_deg=interval(1,2) out=o", 2,
          "planes.angle_deg: 'planes.angle_deg=interval(1,2)' is a space to search in; give values A,B"),
-        ("nowhere.mcap bundle=none out=o", 1, "nowhere.mcap: cannot be read: No such file or directory; give the path of an MCAP file"),
+        ("nowhere.mcap bundle=none out=o", 1, "nowhere.mcap: there is no such recording; give RUN.mcap or a run folder"),
+        ("own.mcap nowhere.mcap bundle=none", 1, "nowhere.mcap: there is no such recording; give RUN.mcap or a run folder"),
     ],
 )  # fmt: skip
 def test_mistakes_are_one_line(tmp_path, capsys, monkeypatch, words, code, message):

@@ -110,8 +110,8 @@ def test_a_replay_of_it_starts_from_its_frames(folder):
     [
         (["room", "room.bag"], 2, "convert: 'room.bag' does not end in .mcap; give for example room.bag.mcap"),
         (["room", "there.mcap"], 2, "there.mcap: exists; give another name or --overwrite"),
-        (["nowhere", "x.mcap"], 1, "nowhere: does not exist; give the folder of a data set or a .mcap file"),
-        (["room/rgb.txt", "x.mcap"], 1, "room/rgb.txt: is not a folder or a recording; give the folder of a data set or a .mcap file"),
+        (["nowhere", "x.mcap"], 1, "nowhere: does not exist; give a folder, a .mcap, .bag or .r3d file"),
+        (["room/rgb.txt", "x.mcap"], 1, "room/rgb.txt: is not a folder or a recording; give a folder, a .mcap, .bag or .r3d file"),
         (["there.mcap", "x.mcap"], 1, "there.mcap: is not an MCAP file; give a file that trihedron run or another MCAP writer wrote"),
         (["room", "x.mcap", "--frames=9:3"], 1, "--frames: '9:3' is not a range of frames A:B[:S] with A < B, S > 0; see trihedron convert --help"),
         (["room", "x.mcap", "--dataset", "tun"], 1, "dataset: there is no plugin 'tun' for the slot 'dataset'; did you mean 'tum'?"),

@@ -51,6 +51,13 @@ def test_equal_recordings_of_different_ranges_and_topics(tmp_path, capsys):
     assert diff(capsys, a, b) == (0, ["equal: 6 frames (4..9) of pose, map"])
     c = record(tmp_path / "c.mcap", range(3), topics=("pose",))
     assert diff(capsys, c, a) == (0, [f"{c} has no map", "equal: 3 frames (0..2) of pose"])
+    assert diff(capsys, c, a, "--tolerance", "0") == (0, [f"{c} has no map", "equal within 0: 3 frames (0..2) of pose"])
+
+
+def test_topics_that_were_not_asked_for_are_not_spoken_of(tmp_path, capsys):
+    a, c = record(tmp_path / "a.mcap", range(3)), record(tmp_path / "c.mcap", range(3), topics=("pose",))
+    assert diff(capsys, a, c, "--topics", "pose") == (0, ["equal: 3 frames (0..2) of pose"])
+    assert diff(capsys, a, c, "--topics", "pose", "--tolerance", "0") == (0, ["equal within 0: 3 frames (0..2) of pose"])
 
 
 def test_the_first_difference_is_named_with_its_size(tmp_path, capsys):

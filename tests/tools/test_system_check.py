@@ -35,6 +35,13 @@ def test_a_module_that_loads():
     assert not system_check.loads("libnothing-of-the-kind.so.1")
 
 
+def test_one_line_says_that_all_is_well(monkeypatch, capsys):
+    monkeypatch.setattr(system_check, "REQUIRED", ("json",))
+    monkeypatch.setattr(system_check, "OPTIONAL", ("csv",))
+    assert system_check.main() == 0
+    assert capsys.readouterr() == ("all libraries load: json, csv\n", "")
+
+
 @pytest.mark.parametrize(("required", "code", "remark"), [(True, 1, ""), (False, 3, " (only the stages that use it need it)")])
 def test_only_a_required_module_is_an_error(monkeypatch, capsys, required, code, remark):
     monkeypatch.setattr(system_check, "REQUIRED", ("json", "no_such_module") if required else ("json",))

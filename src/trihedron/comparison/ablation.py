@@ -70,7 +70,7 @@ class Work:
 
 def options_of(words: Sequence[str], budget: bool = False) -> Options:
     """Sort words into recordings, swaps and settings. A run folder whose name has an equals sign, as those of an ablation have, is one with its path:
-    `runs/axes/manhattan=mixture`, `./manhattan=mixture`. Raises UsageError."""
+    `runs/axes/manhattan=mixture`, `./manhattan=mixture`. Raises UsageError, and DataError for a recording that is not there."""
     recordings = [word for word in words if "=" not in word or Path(word).is_file() or ("/" in word and Path(word).is_dir())]
     rest = [word for word in words if word not in recordings]
     settings = {key: value for key, _, value in (word.partition("=") for word in rest) if key in SETTINGS}
@@ -81,6 +81,9 @@ def options_of(words: Sequence[str], budget: bool = False) -> Options:
         raise UsageError("--budget", f"is of one run, and {len(recordings)} recordings are given", "give one of them")
     if not swaps:
         raise UsageError("ablate", "nothing is swapped", "give STAGE=PLUGIN,PLUGIN or STAGE.OPTION=VALUE,VALUE")
+    paths = tuple(path / "run.mcap" if path.is_dir() else path for path in (Path(word).expanduser() for word in recordings))
+    if (missing := next((path for path in paths if not path.exists()), None)) is not None:
+        raise DataError(str(missing), "there is no such recording", "give RUN.mcap or a run folder")
     if not settings.get("out"):
         raise UsageError("out", "is not given", "give out=DIR for the alternatives")
     feedback = settings.get("feedback", Feedback.new.name)
@@ -89,7 +92,6 @@ def options_of(words: Sequence[str], budget: bool = False) -> Options:
     threads = settings.get("threads", "2")
     if not threads.isdigit() or not 1 <= int(threads) <= MAX_THREADS:
         raise ConfigError("threads", f"{threads} is not a number of threads", f"give 1 to {MAX_THREADS}")
-    paths = tuple(path / "run.mcap" if path.is_dir() else path for path in (Path(word).expanduser() for word in recordings))
     return Options(paths, swaps, Path(settings["out"]).expanduser(), Feedback[feedback], int(threads), budget)
 
 
