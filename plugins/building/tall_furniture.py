@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from trihedron.pipeline.core.linalg import inv, matmul, norm
+from trihedron.pipeline.core.linalg import inv, matmul
 from trihedron.pipeline.core.types import F64
 from trihedron.plugins.building.evidence import Evidence
 from trihedron.plugins.building.faces import Face, longest_run, runs_of
@@ -18,6 +18,7 @@ from trihedron.plugins.building.looks import looks_at
 
 FURNITURE_M = (1.8, 2.5)  # heights of what may be taken for a wall, all as likely
 BELOW_CEILING_M = 0.2  # and no nearer to it
+LEAST_RANGE_M = 0.3  # of those heights, below a low ceiling
 LEAST_LOOKS = 2
 LEAST_LEVELS = 4  # at which views look through below what is read: under a lintel, a beam, the edge of a slab
 LEAST_SHARE = 0.15  # of a stretch's columns, by which its height is judged, and from which it was looked over
@@ -41,11 +42,6 @@ class Doubt:
     normal: F64
     depth_m: float
     wall_probability: float
-
-    @property
-    def area_m2(self) -> float:
-        """Return the area between the stretch and the wall behind it."""
-        return float(norm(self.ends[1] - self.ends[0])) * self.depth_m
 
 
 @dataclass(frozen=True)
@@ -109,7 +105,8 @@ def wall_probability(one: Stretch, highest: float, prior: float) -> float:
     """Return the probability that a stretch is a wall: furniture would have to be as high as it was read, nobody looks over a wall; none hangs."""
     if one.hangs:
         return 0.0
-    as_high = float(np.clip((highest - one.height_m) / (highest - FURNITURE_M[0]), 0.0, 1.0))
+    lowest = min(FURNITURE_M[0], highest - LEAST_RANGE_M)
+    as_high = float(np.clip((highest - one.height_m) / (highest - lowest), 0.0, 1.0))
     wall, furniture = prior * (MISTAKEN if one.over else 1.0), (1.0 - prior) * as_high
     return wall / (wall + furniture) if wall + furniture > 0.0 else 0.0
 

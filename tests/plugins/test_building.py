@@ -319,6 +319,12 @@ def test_a_front_is_a_wall_with_a_probability(height_m, over, prior, low, high):
     assert low <= wall_probability(Stretch(0, 20, height_m, over), 2.5, prior) <= high
 
 
+def test_below_a_low_ceiling_furniture_is_low():
+    """Of 1.9 m: furniture ends at 1.7 m."""
+    assert wall_probability(Stretch(0, 20, 1.8, False), 1.7, 0.25) == 1.0
+    assert 0.2 < wall_probability(Stretch(0, 20, 1.4, False), 1.7, 0.25) < 0.3
+
+
 def test_what_no_view_shows_within_a_room_is_inside_and_within_a_wall_is_not():
     import shapely
 

@@ -84,6 +84,8 @@ def test_the_python_of_the_readme_runs(capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "camera.yaml").write_text("width: 160\nheight: 120\nfx: 131.25\nfy: 131.25\ncx: 79.5\ncy: 59.5\ndepth_scale: 1000\n")
     frames = map(Synthetic(length=5, width=160, height=120), range(5))
-    exec(compile(program, "README.md", "exec"), {"my_camera": ((frame.color, frame.depth_m, frame.stamp_ns / 1e9) for frame in frames)})
+    names = {"my_camera": ((frame.color, frame.depth_m, frame.stamp_ns / 1e9) for frame in frames)}
+    exec(compile(program, "README.md", "exec"), names)
+    names["slam"].close()
     revision, planes, *topics = capsys.readouterr().out.split()
     assert int(revision) > 0 and int(planes) > 0 and topics == ["('frames',", "'manhattan')"]
