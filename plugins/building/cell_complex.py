@@ -17,6 +17,7 @@ from trihedron.plugins.building.jogs import THICKEST_M, parting_columns
 
 OPEN_BORDER_M = 0.15  # area in m² that a metre of border without a wall costs
 UNSEEN = 0.25  # of the area of a cell that no ray passed, which counts against its being inside
+WIDE_M2 = 2.0  # cell, of which all of it does: nobody overlooks so much of a room
 THIN_M = 0.38  # width of a cell that may be within a wall
 CAPACITY = 10_000  # of a square metre: capacities are whole numbers
 ON_LINE_M, LEAST_COSINE = 0.02, 0.9998  # of a stretch on the line of a face
@@ -105,7 +106,8 @@ def inside_cells(cells: Cells) -> Bool:
     """Return the cells (n,) that are inside: those that rays passed, and with them what was not seen and no wall parts from them. What is as thin as
     a wall is solid where no ray passed."""
     thin = np.array([polygon.buffer(-THIN_M / 2.0).is_empty for polygon in cells.polygons])
-    return cut_cells(cells, OPEN_BORDER_M, np.where(thin, 1.0, UNSEEN))
+    wide = np.array([polygon.area > WIDE_M2 for polygon in cells.polygons])
+    return cut_cells(cells, OPEN_BORDER_M, np.where(thin | wide, 1.0, UNSEEN))
 
 
 def cut_cells(cells: Cells, open_border_m: float, unseen: F64 | float) -> Bool:

@@ -332,6 +332,8 @@ def test_what_no_view_shows_within_a_room_is_inside_and_within_a_wall_is_not():
     edges = [(0, 1, 0.0, 1.0), (0, 2, 0.0, 3.0), (1, 2, 0.0, 1.0), (1, 3, 0.0, 1.0), (2, 3, 1.0, 3.0), (3, 4, 1.0, 4.0)]
     cells = Cells(polygons, np.array([1.0, 0.1, 1.0, 0.1, 1.0]), edges)
     assert inside_cells(cells).tolist() == [True, True, True, False, True]
+    unseen = Cells([*polygons, shapely.box(4, 0, 7, 2)], np.array([1.0, 0.1, 1.0, 0.1, 1.0, 0.2]), [*edges, (0, 5, 0.0, 1.0), (2, 5, 0.0, 1.0)])
+    assert not inside_cells(unseen)[5]  # nobody overlooks 6 m² of a room
 
 
 def test_a_benchmark_that_was_stopped_goes_on(tmp_path, monkeypatch):
