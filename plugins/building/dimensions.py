@@ -8,6 +8,7 @@ from itertools import groupby, pairwise
 
 import numpy as np
 
+from trihedron.pipeline.core.plan_areas import edges_of
 from trihedron.pipeline.core.types import F64, Building
 from trihedron.plugins.building.geometry import rooms_on
 
@@ -25,6 +26,11 @@ class Chain:
     high: bool
     stretches: tuple[tuple[float, float], ...]
     whole: tuple[float, float] | None
+
+    @property
+    def rows(self) -> list[tuple[tuple[float, float], ...]]:
+        """Return the rows that are drawn, from the plan outwards."""
+        return [self.stretches, *([(self.whole,)] if self.whole else [])]
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +57,8 @@ def covers(chains: list[Chain], p: F64, q: F64) -> bool:
     return any(
         abs(p[1 - chain.axis] - q[1 - chain.axis]) < SAME_M and _equal((tuple(sorted((p[chain.axis], q[chain.axis]))),), (stretch,))
         for chain in chains
-        for stretch in (*chain.stretches, *((chain.whole,) if chain.whole else ()))
+        for row in chain.rows
+        for stretch in row
     )
 
 
@@ -71,13 +78,11 @@ def _chain(building: Building, storey: int, axis: int, high: bool) -> Chain:
 
 def _edges(building: Building, storey: int, axis: int, high: bool) -> Iterator[_Edge]:
     """Yield the edges of a storey's rooms that a side sees."""
-    rooms = rooms_on(building, storey)
-    for room, begin, end in building.loops:
-        corners, walls = building.corners_m[begin:end], building.corner_walls[begin:end]
-        for p, q, wall in zip(corners, np.roll(corners, -1, axis=0), walls) if room in rooms else ():
+    for room in rooms_on(building, storey):
+        for p, q, wall in edges_of(building, room):
             outward = np.array([q[1] - p[1], p[0] - q[0]]) / max(float(np.hypot(*(q - p))), 1e-9)
             if outward[1 - axis] * (1.0 if high else -1.0) > FACING:
-                yield _Edge(np.array(sorted((p, q), key=lambda end: float(end[axis]))), bool(wall >= 0))
+                yield _Edge(np.array(sorted((p, q), key=lambda end: float(end[axis]))), wall >= 0)
 
 
 def _distinct(places: F64) -> F64:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from trihedron.pipeline.core.linalg import matmul, norm
+from trihedron.pipeline.core.plan_areas import OPEN_M, OPEN_PROBABILITY
 from trihedron.pipeline.core.types import F64
 from trihedron.plugins.building.edges import Edge
 from trihedron.plugins.building.free_space import CELL_M, FreeSpace
@@ -16,7 +17,6 @@ from trihedron.plugins.building.tall_furniture import Doubt
 ON_LINE_M = 0.05
 LEAST_M2 = 0.02  # what would change an area by less is left out
 BESIDE_WALLS_M = 0.15  # where rays end before their readings
-OPEN_M, OPEN_PROBABILITY = 0.5, 0.3  # how far a room goes on beyond an edge that nothing bounds, if it does
 SOLID_PROBABILITY = 0.2  # that what no view shows within a room is none of it
 
 

@@ -17,13 +17,14 @@ from trihedron.plugins.building.geometry import (
     doors_on,
     extent,
     open_edges,
+    openings_on,
     quad,
     rings_of,
     rooms_on,
     wall_corners,
     wall_pieces,
 )
-from trihedron.plugins.building.labels import area_text, label_of, name_of, use_of
+from trihedron.plugins.building.labels import area_text, name_of, title_of
 
 DXF = "floorplan.dxf"
 WALL, UNSEEN, DOOR, GLASS, AREA, DIMENSION, TEXT = "A-WALL", "A-WALL-UNSN", "A-DOOR", "A-GLAZ", "A-AREA", "A-ANNO-DIMS", "A-ANNO-TEXT"
@@ -68,9 +69,8 @@ class _Storey:
             self._ring(ring, UNSEEN)
         for room in rooms_on(self.building, self.storey):
             self._room(room)
-        for opening, wall in enumerate(self.building.opening_walls):
-            if self.building.wall_storeys[wall] == self.storey:
-                self._opening(opening)
+        for opening in openings_on(self.building, self.storey):
+            self._opening(opening)
         self._dimensions()
 
     def _pieces(self, seen: bool) -> Iterator[F64]:
@@ -98,7 +98,7 @@ class _Storey:
             self._ring(ring, AREA)
         for p, q in open_edges(self.building, room):
             self._line(p, q, UNSEEN)
-        text = " – ".join(filter(None, (label_of(self.building, "room", room), use_of(self.building, room)))) + f": {area_text(self.building, room)}"
+        text = f"{title_of(self.building, 'room', room)}: {area_text(self.building, room)}"
         self._text(text, *_text_place(self.building, room, len(text)))
 
     def _opening(self, k: int) -> None:
@@ -122,7 +122,7 @@ class _Storey:
         for chain in chains_of(self.building, self.storey):
             points = np.concatenate(corners)
             edge, outward = (points[:, 1 - chain.axis].max(), 1.0) if chain.high else (points[:, 1 - chain.axis].min(), -1.0)
-            for k, row in enumerate([chain.stretches, *([(chain.whole,)] if chain.whole else [])], 1):
+            for k, row in enumerate(chain.rows, 1):
                 for begin, end in row:
                     ends = [np.array([at, edge] if chain.axis == 0 else [edge, at]) + self.shift for at in (begin, end)]
                     base = ends[0] + np.array([0.0, outward] if chain.axis == 0 else [outward, 0.0]) * k * APART_M

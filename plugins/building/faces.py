@@ -50,9 +50,12 @@ class Face:
 
     def share(self, begin_m: float, end_m: float, columns: Bool) -> float:
         """Return the share of a stretch whose columns (k,) are marked."""
-        a, b = (round((value - self.start_m) / CELL_M) for value in (begin_m, end_m))
-        wanted = max(b - a, 1)
-        return float(columns[max(a, 0) : max(max(a, 0), b, 0)].sum()) / wanted if b > a else float(columns[min(max(a, 0), len(columns) - 1)])
+        a, b = self.column_at(begin_m), self.column_at(end_m)
+        return float(columns[max(a, 0) : max(b, 0)].sum()) / (b - a) if b > a else float(columns[min(max(a, 0), len(columns) - 1)])
+
+    def column_at(self, along_m: float) -> int:
+        """Return the number of the column that begins nearest to a place along the face; it may be none of its own."""
+        return round((along_m - self.start_m) / CELL_M)
 
 
 def tall_m(storey: Storey) -> float:

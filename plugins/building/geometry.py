@@ -15,6 +15,7 @@ import numpy as np
 from trihedron.pipeline.core.drawings import Drawing, Outline, Solid
 from trihedron.pipeline.core.geometry import transform
 from trihedron.pipeline.core.linalg import matmul, norm
+from trihedron.pipeline.core.plan_areas import edges_of
 from trihedron.pipeline.core.registry import register_drawing
 from trihedron.pipeline.core.types import F64, I32, OPENING_KINDS, Building
 from trihedron.plugins.building.labels import label_of
@@ -80,11 +81,7 @@ def rings_of(building: Building, room: int) -> list[F64]:
 
 def open_edges(building: Building, room: int) -> Iterator[F64]:
     """Yield the edges (2, 2) of a room that nothing bounds."""
-    for ring in building.loops[building.loops[:, 0] == room]:
-        corners, walls = building.corners_m[ring[1] : ring[2]], building.corner_walls[ring[1] : ring[2]]
-        for p, q, wall in zip(corners, np.roll(corners, -1, axis=0), walls):
-            if wall < 0:
-                yield np.array([p, q])
+    yield from (np.array([p, q]) for p, q, wall in edges_of(building, room) if wall < 0)
 
 
 def wall_corners(building: Building, room: int) -> Iterator[F64]:
@@ -119,13 +116,14 @@ def door_swing(building: Building, opening: int) -> F64:
     return np.array([hinge, jamb, jamb + out, hinge + out])
 
 
+def openings_on(building: Building, storey: int) -> list[int]:
+    """Return the openings of a storey."""
+    return [k for k, wall in enumerate(building.opening_walls) if building.wall_storeys[wall] == storey]
+
+
 def doors_on(building: Building, storey: int) -> list[int]:
     """Return the doors of a storey."""
-    return [k for k, wall in enumerate(building.opening_walls) if building.wall_storeys[wall] == storey and _is_door(building, k)]
-
-
-def _is_door(building: Building, opening: int) -> bool:
-    return OPENING_KINDS[building.opening_kinds[opening]] == "door"
+    return [k for k in openings_on(building, storey) if OPENING_KINDS[building.opening_kinds[k]] == "door"]
 
 
 def box_place(free: Any, wide: float, high: float) -> F64 | None:

@@ -165,6 +165,11 @@ def label_of(building: Building, element: str, number: int) -> str:
     return name_of(building, element, number) or f"{kind_of(building, element, number)} {number}"
 
 
+def title_of(building: Building, element: str, number: int) -> str:
+    """Return the label of an element, of a room with its use."""
+    return " – ".join(filter(None, (label_of(building, element, number), use_of(building, number) if element == "room" else "")))
+
+
 def area_text(building: Building, room: int) -> str:
     """Return the area of a room: with its standard deviation where that tells all, else with its 95 % interval; "seen" where its walls were not seen
     all round."""

@@ -28,7 +28,7 @@ SMALL = 20.0  # points a metre, of a scale whose bar is in steps of five metres
 FIRST_DATE_S = 946684800  # 2000-01-01; stamps before it are no times of day
 
 
-def title_of(building: Building, name: str, scale: str) -> Letters:
+def title_of_plan(building: Building, name: str, scale: str) -> Letters:
     """Return the title: the run's name, the day (UTC) of the recording if its stamps tell one, and the scale."""
     seconds = building.stamp_ns // 1_000_000_000
     date = datetime.fromtimestamp(seconds, timezone.utc).strftime("%Y-%m-%d") if seconds >= FIRST_DATE_S else ""

@@ -14,7 +14,7 @@ from trihedron.plugins.building.evidence import Evidence
 from trihedron.plugins.building.faces import Face
 from trihedron.plugins.building.free_space import CELL_M, LEVEL_M, FreeSpace
 from trihedron.plugins.building.free_space_kernels import LEVELS, U32
-from trihedron.plugins.building.jogs import is_recess
+from trihedron.plugins.building.jogs import WIDEST_DOOR_M, is_recess
 from trihedron.plugins.building.levels import Storey, sliding_sum
 from trihedron.plugins.building.rooms import RoomPlan, room_at
 from trihedron.plugins.building.walls import AROUND_M, WallPlan
@@ -22,7 +22,7 @@ from trihedron.plugins.building.walls import AROUND_M, WallPlan
 WINDOW_M = 0.35  # least height of a window's sill
 STEP_M = 0.025
 BEHIND_M = 0.1  # a ray that gets so far behind a wall has crossed it
-NARROWEST_M, WIDEST_DOOR_M = 0.4, 1.6
+NARROWEST_M = 0.4
 LEAST_LEVELS = 5
 SPARSE = 0.2  # of the readings beside it, fewer than which an opening has: a wall's that lets rays through by their noise is as dense as ever
 END_STEP_M = 0.01

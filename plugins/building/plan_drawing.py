@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from trihedron.pipeline.core.linalg import norm
+from trihedron.pipeline.core.plan_areas import edges_of
 from trihedron.pipeline.core.types import F64, OPENING_KINDS, Building
 from trihedron.plugins.building.dimensions import Chain, chains_of, covers
 from trihedron.plugins.building.geometry import (
@@ -19,14 +20,15 @@ from trihedron.plugins.building.geometry import (
     door_swing,
     doors_on,
     open_edges,
+    openings_on,
     quad,
     rings_of,
     rooms_on,
     wall_corners,
     wall_pieces,
 )
-from trihedron.plugins.building.labels import area_text, id_of, label_of, use_of
-from trihedron.plugins.building.legend import legend_groups, title_of
+from trihedron.plugins.building.labels import area_text, id_of, label_of, title_of
+from trihedron.plugins.building.legend import legend_groups, title_of_plan
 from trihedron.plugins.building.sheet import FONTS, Group, Letters, Mark, Shape, Sheet, bounds, line, moved, width_of
 
 EDGE, GAP, ROW = 14.0, 40.0, 17.0  # points: round the sheet, between storeys, between rows of dimensions
@@ -48,7 +50,7 @@ def draw_plan(building: Building, per_m: float, name: str = "", scale: str = "")
         groups += moved(drawn, np.array([x - low[0], 0.0]))
         x += high[0] - low[0] + GAP
     low, high = bounds(groups)
-    title = title_of(building, name, scale)
+    title = title_of_plan(building, name, scale)
     groups.append(Group((title.moved(np.array([low[0], low[1] - 16.0]) - title.corners()[3]),)))
     legend = legend_groups(
         building, per_m, listed, high[0] - low[0], {mark.style for group in groups for mark in group.marks if isinstance(mark, Shape)}
@@ -71,12 +73,13 @@ class _Storey:
     def groups(self) -> list[Group]:
         """Draw all of it."""
         building, chains = self.building, chains_of(self.building, self.storey)
-        drawn = [*self._surfaces(), *(self._opening(k) for k in self._openings())]
+        openings = openings_on(building, self.storey)
+        drawn = [*self._surfaces(), *(self._opening(k) for k in openings)]
         self.taken = list(self._obstacles())
         texts: list[Mark] = []
         for room in sorted(rooms_on(building, self.storey), key=lambda room: -float(building.areas_m2[room])):
             texts += self._room_label(room)
-        for opening in self._openings():
+        for opening in openings:
             texts += self._heights(opening)
         texts += [text for p, q in self._lengths(chains) if (text := self._length(p, q)) is not None]
         drawn += [Group(tuple(texts)), *self._chains(chains, *bounds([*drawn, Group(tuple(texts))]))]
@@ -88,9 +91,6 @@ class _Storey:
     def at(self, points: F64) -> F64:
         """Return points (..., 2) of the plan on the paper."""
         return np.asarray(points, np.float64) * [self.per_m, -self.per_m]
-
-    def _openings(self) -> list[int]:
-        return [k for k, wall in enumerate(self.building.opening_walls) if self.building.wall_storeys[wall] == self.storey]
 
     def _surfaces(self) -> Iterator[Group]:
         """Draw rooms, walls, and edges that nothing bounds."""
@@ -104,8 +104,7 @@ class _Storey:
         yield Group(tuple(line("unseen", *self.at(edge)) for room in rooms for edge in open_edges(building, room)))
 
     def _group(self, element: str, k: int, marks: Any) -> Group:
-        title = " – ".join(filter(None, (label_of(self.building, element, k), use_of(self.building, k) if element == "room" else "")))
-        return Group(tuple(marks), id_of(self.building, element, k), title)
+        return Group(tuple(marks), id_of(self.building, element, k), title_of(self.building, element, k))
 
     def _opening(self, k: int) -> Group:
         """Draw a window as glass, a door as a leaf with its swing, a passage as a gap. Which way a door turns is not known: a convention."""
@@ -193,9 +192,8 @@ class _Storey:
     def _lengths(self, chains: list[Chain]) -> Iterator[tuple[F64, F64]]:
         """Yield the ends of edges of rooms that are walls and whose length no chain gives; without any room, of the walls."""
         building, rooms = self.building, rooms_on(self.building, self.storey)
-        for room, begin, end in building.loops:
-            corners, walls = building.corners_m[begin:end], building.corner_walls[begin:end]
-            for p, q, wall in zip(corners, np.roll(corners, -1, axis=0), walls) if room in rooms else ():
+        for room in rooms:
+            for p, q, wall in edges_of(building, room):
                 if wall >= 0 and not covers(chains, p, q):
                     yield p, q
         if not rooms:
@@ -221,9 +219,8 @@ class _Storey:
         for chain in chains:
             edge = (low if (chain.axis == 0) == chain.high else high)[1 - chain.axis]
             outward = -1.0 if (chain.axis == 0) == chain.high else 1.0
-            rows = [chain.stretches, *([(chain.whole,)] if chain.whole else [])]
             numbers: list[Any] = []
-            for k, row in enumerate(rows, 1):
+            for k, row in enumerate(chain.rows, 1):
                 ends = np.array(row) * (self.per_m if chain.axis == 0 else -self.per_m)
                 marks += _dimension_row(chain.axis, edge + outward * k * ROW, outward, ends, self.per_m, numbers)
                 stops = [_on(chain.axis, stop, edge + outward * k * ROW) for stop in np.unique(ends)]

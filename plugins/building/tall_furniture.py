@@ -163,7 +163,7 @@ def _depth_to_wall(face: Face, one: Stretch, faces: list[Face]) -> float | None:
         depth = face.offset_m - other.offset_m
         if other is face or float(matmul(other.normal, face.normal)) < 0.999 or not 0.03 < depth < DEEPEST_M:
             continue
-        first, stop = (round((value - other.start_m) / CELL_M) for value in (begin, end))
+        first, stop = other.column_at(begin), other.column_at(end)
         if other.known[max(first, 0) : max(stop, 0)].sum() * CELL_M >= STRIP_M:
             found.append(depth)
     return min(found, default=None)
@@ -174,6 +174,6 @@ def _wall_on_both_sides(face: Face, one: Stretch, depth: float, faces: list[Face
     width, begin, end = round(2.0 * STRIP_M / CELL_M), face.start_m + CELL_M * one.begin, face.start_m + CELL_M * one.end
     for other in faces:
         if float(matmul(other.normal, face.normal)) > 0.999 and abs(face.offset_m - other.offset_m - depth) < 1e-9:
-            first, stop = (round((value - other.start_m) / CELL_M) for value in (begin, end))
+            first, stop = other.column_at(begin), other.column_at(end)
             return bool(other.tall[max(first - width, 0) : max(first, 0)].any() and other.tall[max(stop, 0) : max(stop + width, 0)].any())
     return False

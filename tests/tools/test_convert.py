@@ -155,47 +155,33 @@ def test_renamed_types_and_fields_are_upgraded(tmp_path, monkeypatch, capsys):
     assert main(["diff", str(expected), str(new)]) == 0
 
 
-def test_a_map_without_proposals_is_upgraded(tmp_path):
-    """Version 7 of a map, of the recording's present format, lacks that table, which is empty after it."""
+@pytest.mark.parametrize(
+    ("topic", "of", "older", "lacking"),
+    [
+        ("map", lambda index: empty_map(index, index, 32, 32, 8), "Map version 7, this program reads version 8", "proposals"),
+        ("building", lambda index: Building.empty(index, index, "no plane was seen"), "Building version 1, this program reads version 2", "doubts"),
+    ],
+)
+def test_a_value_without_a_later_field_is_upgraded(tmp_path, topic, of, older, lacking):
+    """An older version of a type, of the recording's present format, lacks a table or an array, which is empty after it."""
     recorded, before, after = (tmp_path / f"{name}.mcap" for name in ("recorded", "before", "after"))
     writer = RecordingWriter(recorded, {})
     for index in range(3):
-        writer.write("map", empty_map(index, index, 32, 32, 8))
+        writer.write(topic, of(index))
     writer.close()
-    rewrite(recorded, before, without_proposals)
-    with pytest.raises(RecordingError, match="holds Map version 7, this program reads version 8; upgrade"):
-        list(Recording(before).values("map"))
+    rewrite(recorded, before, partial(without, lacking))
+    with pytest.raises(RecordingError, match=f"holds {older}; upgrade"):
+        list(Recording(before).values(topic))
     assert main(["convert", str(before), str(after)]) == 0
-    expected, upgraded = (list(Recording(path).values("map")) for path in (recorded, after))
-    assert [Encoder().encode(map) for map in upgraded] == [Encoder().encode(map) for map in expected] and len(upgraded) == 3
+    expected, upgraded = (list(Recording(path).values(topic)) for path in (recorded, after))
+    assert [Encoder().encode(value) for value in upgraded] == [Encoder().encode(value) for value in expected] and len(upgraded) == 3
 
 
-def test_a_building_without_doubts_is_upgraded(tmp_path):
-    """Version 1 of a building lacks them; none is after it."""
-    recorded, before, after = (tmp_path / f"{name}.mcap" for name in ("recorded", "before", "after"))
-    writer = RecordingWriter(recorded, {})
-    for index in range(3):
-        writer.write("building", Building.empty(index, index, "no plane was seen"))
-    writer.close()
-    rewrite(recorded, before, without_doubts)
-    with pytest.raises(RecordingError, match="holds Building version 1, this program reads version 2; upgrade"):
-        list(Recording(before).values("building"))
-    assert main(["convert", str(before), str(after)]) == 0
-    expected, upgraded = (list(Recording(path).values("building")) for path in (recorded, after))
-    assert [Encoder().encode(one) for one in upgraded] == [Encoder().encode(one) for one in expected] and len(upgraded) == 3
-
-
-def without_doubts(data):
-    message = message_class("Building").FromString(data)
-    message.version = 1
-    message.ClearField("doubts")
-    return message.SerializeToString()
-
-
-def without_proposals(data):
-    message = message_class("Map").FromString(data)
-    message.version = 7
-    message.ClearField("proposals")
+def without(field, data):
+    """A message of the version before, which lacks a field."""
+    message = message_class(LegacyMessage.FromString(data).type).FromString(data)
+    message.version -= 1
+    message.ClearField(field)
     return message.SerializeToString()
 
 
