@@ -7,6 +7,7 @@ vertical only. Every surface is a face with a material and, where it is flat, a 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from enum import Enum
 
 import numpy as np
 
@@ -55,12 +56,40 @@ class Solid:
         return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
+class Glass(Enum):
+    """What a pane does: reflects, is seen through, is seen through but swallows the projector's light."""
+
+    mirror = 0
+    inner = 1
+    outer = 2
+
+
+@dataclass(frozen=True)
+class Pane:
+    """A rectangle from `origin` (3,) along the unit directions `u`, `v` (3,), with the unit normal (3,) towards the side from which a mirror is
+    seen; metres, in the frame of the scene."""
+
+    kind: Glass
+    origin: F64
+    u: F64
+    v: F64
+    normal: F64
+    size_m: tuple[float, float]
+
+
+def pane_before(face: Face, kind: Glass, off_m: float = 0.005, frame_m: float = 0.04) -> Pane:
+    """Put a pane before a flat face, within a frame of it."""
+    width, height = face.size_m
+    origin = face.origin + off_m * face.normal + frame_m * (face.u + face.v)
+    return Pane(kind, origin, face.u, face.v, face.normal, (width - 2.0 * frame_m, height - 2.0 * frame_m))
+
+
 @dataclass(frozen=True)
 class Room:
     """Walls, floor and ceiling as (k, 4) planes `n·x + d = 0` with n into the room, their faces in the same order, and the furniture.
 
     A face is lit by the nearest lamp in front of it; `detail` multiplies the resolution of the textures; `storeys_m` are heights of floor and
-    ceiling."""
+    ceiling, `panes` mirrors and glass before the rest."""
 
     planes: F64
     faces: tuple[Face, ...]
@@ -68,6 +97,7 @@ class Room:
     lamps_m: tuple[tuple[float, float, float], ...] = (LAMP_M,)
     detail: float = 1.0
     storeys_m: tuple[tuple[float, float], ...] = ((0.0, HEIGHT_M),)
+    panes: tuple[Pane, ...] = ()
 
 
 def box(x: tuple[float, float], y: tuple[float, float], z: tuple[float, float], material: str, front: str = "", front_face: int = 0) -> Solid:

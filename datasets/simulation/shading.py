@@ -54,13 +54,13 @@ def _shade(surfaces: F64, atlas: Atlas, view: CameraView, depth: F64, faces: I32
         dy = (y - view.cy) / view.fy
         for x in range(w):
             dx, t = (x - view.cx) * per_px, depth[y, x]
-            r, g, b, c = _color_at(surfaces, texels, levels, per_metre, position, R, dx, dy, t, t * per_px, faces[y, x])
+            r, g, b, c = color_at(surfaces, texels, levels, per_metre, position, R, dx, dy, t, t * per_px, faces[y, x])
             color[y, x, 0], color[y, x, 1], color[y, x, 2] = np.uint8(r + 0.5), np.uint8(g + 0.5), np.uint8(b + 0.5)
             cosine[y, x] = c
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def _color_at(
+def color_at(
     surfaces: F64, texels: U8, levels: NDArray[np.int64], per_metre: F64, position: F64, R: F64,
     dx: float, dy: float, t: float, pixel_m: float, face: int,
 ) -> tuple[float, float, float, float]:  # fmt: skip
@@ -167,7 +167,7 @@ def _smooth_pixel(
     r = g = b = 0.0
     for k in range(found):
         n, share = seen[k, 1], seen[k, 1] / samples
-        r1, g1, b1, _ = _color_at(
+        r1, g1, b1, _ = color_at(
             geometry.faces, atlas.texels, atlas.levels, atlas.per_metre, view.position, view.R_world_camera,
             seen[k, 2] / n, seen[k, 3] / n, seen[k, 4] / n, seen[k, 4] / n / view.fx, int(seen[k, 0]),
         )  # fmt: skip

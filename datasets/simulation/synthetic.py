@@ -14,8 +14,9 @@ from trihedron.datasets.readers.sequence import clip_range
 from trihedron.datasets.simulation import buildings
 from trihedron.datasets.simulation.buildings import Building
 from trihedron.datasets.simulation.depth_noise import KINECT, STEREO, noisy_color, sensed_depth
-from trihedron.datasets.simulation.flats import random_flat, whole_floor
+from trihedron.datasets.simulation.flats import glazed_flat, random_flat, whole_floor
 from trihedron.datasets.simulation.furniture import curved_pieces
+from trihedron.datasets.simulation.glass import look_through
 from trihedron.datasets.simulation.motion import Motion, camera_pose
 from trihedron.datasets.simulation.raytracing import Geometry, geometry_of
 from trihedron.datasets.simulation.room import BOX, Room, all_faces, furnished_room
@@ -31,8 +32,8 @@ from trihedron.pipeline.core.types import EXACT_DEPTH, F32, F64, I32, U8, Bool, 
 
 class Scene(Enum):
     """Scene that the camera is in: one furnished room, a corridor that ends where it began, two identical offices on a corridor, ten rooms in a
-    circuit, an L-shaped flat, two rooms with slanted walls, two storeys joined by stairs, a furnished flat drawn by its number, a
-    floor of eight furnished rooms on a corridor."""
+    circuit, an L-shaped flat, two rooms with slanted walls, two storeys joined by stairs, a furnished flat drawn by its number, the
+    same with mirrors and glass, a floor of eight furnished rooms on a corridor."""
 
     room = "room"
     corridor = "corridor"
@@ -42,6 +43,7 @@ class Scene(Enum):
     slanted_flat = "slanted_flat"
     house = "house"
     random_flat = "random_flat"
+    glazed_flat = "glazed_flat"
     whole_floor = "whole_floor"
 
 
@@ -55,6 +57,7 @@ class Sensor(Enum):
 BUILDINGS: dict[Scene, Callable[[], Building]] = {Scene.corridor: buildings.corridor, Scene.offices: buildings.offices, Scene.rooms: buildings.rooms,
              Scene.flat: buildings.flat, Scene.slanted_flat: buildings.slanted_flat, Scene.house: buildings.house,
              Scene.whole_floor: whole_floor}  # fmt: skip
+FLATS: dict[Scene, Callable[[int], Building]] = {Scene.random_flat: random_flat, Scene.glazed_flat: glazed_flat}
 SENSORS = {Sensor.kinect: KINECT, Sensor.stereo: STEREO}
 ROOM_FRAMES = 150  # of the room, whose walk never ends
 FOCAL_PER_WIDTH = 525.0 / 640.0  # a Kinect's nominal colour camera
@@ -66,7 +69,7 @@ class Synthetic:
     """A furnished room of 5 × 4 × 2.7 m, or a building, ray traced when a frame is asked for. Frame i depends on the fields and i alone."""
 
     frames: Frames = ""  # part to make, half open: A:B, A:, :B, every S-th A:B:S; empty = all
-    scene: Scene = Scene.room  # room | corridor | offices | rooms | flat | slanted_flat | house | random_flat | whole_floor
+    scene: Scene = Scene.room  # room | corridor | offices | rooms | flat | slanted_flat | house | random_flat | glazed_flat | whole_floor
     length: NonNegativeInt = 0  # frames; 0 = the scene's own: 150 of the room, once round a building (a longer walk goes on)
     fps: PositiveFloat = 30.0
     seed: NonNegativeInt = 0  # of textures, path and noise
@@ -78,7 +81,7 @@ class Synthetic:
     motion: Motion = Motion.walk  # walk | fast | still | pan; in a building only walk
     slanted: bool = False  # turns two of the room's walls by about 10°
     curved: bool = False  # adds a column, a ball and a plant to the room
-    flat: NonNegativeInt = 0  # number of a random_flat
+    flat: NonNegativeInt = 0  # number of a random_flat or glazed_flat
 
     def __post_init__(self) -> None:
         if self.scene is not Scene.room and self.motion is not Motion.walk:
@@ -88,8 +91,8 @@ class Synthetic:
         if self.scene is not Scene.room and self.curved:
             raise ValueError("curved: only the room has these pieces")
 
-        if self.scene is not Scene.random_flat and self.flat:
-            raise ValueError("flat: only scene=random_flat has a number")
+        if self.scene not in FLATS and self.flat:
+            raise ValueError("flat: only scene=random_flat and scene=glazed_flat have a number")
 
     def __len__(self) -> int:
         return len(self._range)
@@ -99,11 +102,15 @@ class Synthetic:
         number = self._range[index]
         geometry, atlas = self._scene
         color, exact, _, cosine = render(geometry, atlas, self._camera, self._pose(number))
+        panes = self._room.panes
+        lost = look_through(panes, geometry, atlas, self._camera, self._pose(number), color, exact, cosine) if panes else None
         depth = exact.astype(np.float32)
         if self.noise:
             rng = np.random.default_rng([self.seed, 3, number])
             depth = sensed_depth(exact, cosine, self._camera.fx, SENSORS[self.sensor], rng)
             color = noisy_color(color, rng)
+        if lost is not None:
+            depth[lost] = 0.0
         return Frame(number, self._stamp_ns(number), color, depth, self._camera)
 
     def truth(self) -> Trajectory | None:
@@ -189,7 +196,7 @@ class Synthetic:
 
 @cache
 def _building_of(scene: Scene, flat: int) -> Building | None:
-    return random_flat(flat) if scene is Scene.random_flat else BUILDINGS[scene]() if scene in BUILDINGS else None
+    return FLATS[scene](flat) if scene in FLATS else BUILDINGS[scene]() if scene in BUILDINGS else None
 
 
 @cache

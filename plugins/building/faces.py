@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
@@ -64,20 +64,30 @@ def tall_m(storey: Storey) -> float:
     return float(min(TALL_M, top - storey.bottom_m - BELOW_CEILING_M))
 
 
-def faces_of(evidence: Evidence, storey: Storey, space: FreeSpace, directions: F64, least_m: float, cone_deg: float = 6.0) -> list[Face]:
+def faces_of(evidence: Evidence, storey: Storey, space: FreeSpace, directions: F64, least_m: float) -> list[Face]:
     """Find the faces with unit normals among `directions` (d, 2) that reach high over a stretch of at least that length."""
+    found: list[Face] = []
+    for face in upright_faces(evidence, storey, directions):
+        face = replace(face, tall=close_gaps(_tall_columns(face, space, storey)))
+        if longest_run(face.tall) * CELL_M >= least_m and not any(_hides(other, face) for other in found):
+            found.append(face)
+    return found
+
+
+def upright_faces(evidence: Evidence, storey: Storey, directions: F64, cone_deg: float = 6.0) -> list[Face]:
+    """Find the faces with unit normals among `directions` (d, 2), high and low; of each direction the strongest first."""
     found: list[Face] = []
     height = evidence.points[:, 2] - storey.bottom_m
     top = storey.ceiling_m - storey.bottom_m - 0.05 if np.isfinite(storey.ceiling_m) else LEVELS * LEVEL_M
     upright = (np.abs(evidence.normals[:, 2]) < np.sin(np.radians(UPRIGHT_DEG))) & (height > 0.0) & (height < top)
     for normal in directions:
         facing = matmul(evidence.normals[:, :2], normal) > np.cos(np.radians(cone_deg))
-        found += _faces_along(evidence, height, normal, np.nonzero(upright & facing)[0], storey, space, least_m)
+        found += _faces_along(evidence, height, normal, np.nonzero(upright & facing)[0], storey)
     return found
 
 
-def _faces_along(evidence: Evidence, height: F64, normal: F64, members: I64, storey: Storey, space: FreeSpace, least_m: float) -> list[Face]:
-    """Find the faces of one direction: the peaks of the offsets of its high points."""
+def _faces_along(evidence: Evidence, height: F64, normal: F64, members: I64, storey: Storey) -> list[Face]:
+    """Find the faces of one direction: the peaks of the offsets of its points above HIGH_M."""
     high = height[members] > min(HIGH_M, tall_m(storey))
     if not high.any():
         return []
@@ -101,17 +111,14 @@ def _faces_along(evidence: Evidence, height: F64, normal: F64, members: I64, sto
         columns = ((along[close] - start) / CELL_M).astype(int)
         width = int(columns.max()) + 1
         count = np.bincount(columns * LEVELS + levels[close], minlength=width * LEVELS).reshape(width, LEVELS).astype(np.int32)
-        reach = _close_gaps(_tall_columns(Face(normal, offset, start, count, np.zeros(len(count), np.bool_), members[close]), space, storey))
-        face = Face(normal, offset, start, count, reach, members[close])
-        if longest_run(reach) * CELL_M >= least_m and not any(_hides(other, face) for other in found):
-            found.append(face)
+        found.append(Face(normal, offset, start, count, np.zeros(width, np.bool_), members[close]))
     return found
 
 
 def _hides(greater: Face, lesser: Face) -> bool:
     """Say if a face is furniture on a greater one, or its stray readings."""
     away = abs(greater.offset_m - lesser.offset_m)
-    if away >= SAME_FACE_M:
+    if float(matmul(greater.normal, lesser.normal)) < 0.999 or away >= SAME_FACE_M:
         return False
     beside = [greater.share(lesser.start_m + CELL_M * a, lesser.start_m + CELL_M * b, greater.tall) for a, b in runs_of(lesser.tall)]
     return away < NEAR_FACE_M or max(beside) > 0.2
@@ -147,7 +154,7 @@ def longest_run(columns: Bool) -> int:
     return max((b - a for a, b in runs_of(columns)), default=0)
 
 
-def _close_gaps(columns: Bool, gap: int = 2) -> Bool:
+def close_gaps(columns: Bool, gap: int = 2) -> Bool:
     """Close gaps of so many columns or fewer."""
     out = columns.copy()
     marked = np.nonzero(columns)[0]

@@ -16,10 +16,11 @@ from trihedron.plugins.building.assembly import StoreyPlan, assemble_building, e
 from trihedron.plugins.building.cell_complex import Cells, cells_of, inside_cells
 from trihedron.plugins.building.doubts import doubts_of
 from trihedron.plugins.building.evidence import Evidence
-from trihedron.plugins.building.faces import faces_of, slanted_directions
+from trihedron.plugins.building.faces import faces_of, slanted_directions, upright_faces
 from trihedron.plugins.building.free_space import free_space
 from trihedron.plugins.building.jogs import SHORT_M, jog_sides
 from trihedron.plugins.building.levels import Storey, in_storey, storeys_of
+from trihedron.plugins.building.mirrors import mirrors_of, upright_readings, without_mirrors
 from trihedron.plugins.building.openings import openings_of
 from trihedron.plugins.building.rooms import rooms_of
 from trihedron.plugins.building.tall_furniture import remove_furniture
@@ -46,8 +47,11 @@ def plan_building(
     storeys, plans = storeys_of(evidence), []
     for number, storey in enumerate(storeys):
         here = in_storey(evidence, storeys, number)
+        axes = directions(here, storey)
+        if mirrors := mirrors_of(upright_faces(here, storey, axes), upright_readings(here, storey), storey):
+            here = without_mirrors(here, mirrors)
         space = free_space(here, storey)
-        found = faces_of(here, storey, space, directions(here, storey), min(SHORT_M, options.least_wall_m))
+        found = faces_of(here, storey, space, axes, min(SHORT_M, options.least_wall_m))
         faces, doubts = remove_furniture(found, here, storey, space, options.least_wall_m)
         faces += jog_sides(faces, here)
         cells = cells_of(faces, space)

@@ -9,13 +9,14 @@ from numpy.typing import NDArray
 
 from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import F64, I32, Bool
-from trihedron.plugins.building.edges import FIT_M
+from trihedron.plugins.building.edges import FIT_M, Edge
 from trihedron.plugins.building.evidence import Evidence
 from trihedron.plugins.building.faces import Face
 from trihedron.plugins.building.free_space import CELL_M, LEVEL_M, FreeSpace
 from trihedron.plugins.building.free_space_kernels import LEVELS, U32
 from trihedron.plugins.building.jogs import WIDEST_DOOR_M, is_recess
 from trihedron.plugins.building.levels import Storey, sliding_sum
+from trihedron.plugins.building.mirrors import UprightReadings, is_reflection, upright_readings
 from trihedron.plugins.building.rooms import RoomPlan, room_at
 from trihedron.plugins.building.walls import AROUND_M, WallPlan
 
@@ -45,16 +46,23 @@ def openings_of(
     walls: list[WallPlan], rooms: list[RoomPlan], faces: list[Face], evidence: Evidence, space: FreeSpace, storey: Storey
 ) -> list[OpeningPlan]:
     """Find the stretches of each wall that rays cross from well before it to well behind it, at the same heights."""
-    found = []
+    found, readings = [], upright_readings(evidence, storey)
     for number, wall in enumerate(walls):
         levels = _crossing_levels(wall, space)
         crossed = np.array([bin(int(value)).count("1") >= 3 for value in levels], bool)
         marked = np.nonzero(_close_gaps(crossed))[0]
         for run in np.split(marked, np.nonzero(np.diff(marked) > 1)[0] + 1) if len(marked) else []:
             opening = _opening(number, wall, run, levels, evidence, storey, rooms, faces)
-            if opening is not None:
+            if opening is not None and not _is_mirror(opening, wall.edge, storey, readings):
                 found.append(opening)
     return found
+
+
+def _is_mirror(opening: OpeningPlan, edge: Edge, storey: Storey, readings: UprightReadings) -> bool:
+    """Say if an opening is a mirror, as it is taken for where little is read through it and there is a room on one side only."""
+    low, high = opening.heights
+    reflects = is_reflection(edge.face, opening.span, (storey.bottom_m + low, storey.bottom_m + high), readings) if edge.face else False
+    return min(opening.rooms) < 0 if reflects is None else reflects
 
 
 def _close_gaps(columns: Bool) -> Bool:

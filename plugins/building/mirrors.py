@@ -1,0 +1,198 @@
+"""Mirrors: where views read, through the line of a face, what they read before it as well, reflected. Such readings are put onto the face."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from trihedron.pipeline.core.linalg import matmul
+from trihedron.pipeline.core.types import F64, I32, Bool
+from trihedron.plugins.building.evidence import UPRIGHT_DEG, Evidence
+from trihedron.plugins.building.faces import HIGH_M, Face, close_gaps, longest_run, runs_of
+from trihedron.plugins.building.free_space import CELL_M, LEVEL_M
+from trihedron.plugins.building.levels import Storey, sliding_sum
+from trihedron.plugins.shared.keyframe_views import KeyframeView
+from trihedron.plugins.shared.voxel_hash_kernels import I64
+
+EVERY = 4
+BEFORE_M, BEHIND_M = 0.3, 0.15  # of an eye and of its reading, for a ray that crosses a face
+FACING, ASIDE_WEIGHT = 0.7, 0.3  # of readings of surfaces that face a line, others' weight: a wall square to it may go on behind it
+SAME_M = 0.1  # side of the voxels in which readings are the same
+NEIGHBOURS = (0, 1 << 42, -(1 << 42), 1 << 22, -(1 << 22), 4, -4)  # steps of keys to voxels that share a side
+REACH = 3  # columns, of a face to the wall square to it that it reaches
+LEAST_FACING = 5
+BROAD, LEAST_WEIGHT = 3, 3.0  # of readings in so many neighbouring columns of a face
+LEAST_SHARE = 0.5  # of the readings through a mirror that repeat what is before it
+NARROWEST_M, RIM_M = 0.15, 0.05
+ASIDE_M = 0.4  # from the way of the camera to the jamb of what it goes through
+LEAST_FACE_M, WIDEST_M = 0.2, 1.2  # of a face that is read, of a gap in it
+
+
+@dataclass(frozen=True)
+class Mirror:
+    """The part of the line n·p = offset of a face between two places along it and two heights, m."""
+
+    normal: F64
+    offset_m: float
+    span: tuple[float, float]
+    heights: tuple[float, float]
+
+    def crossing(self, eye: F64, points: F64) -> tuple[F64, Bool]:
+        """Return the shares (n,) of the ways from eyes (3,) or (n, 3) to points (n, 3) that are before the mirror, and which rays (n,) it turns back."""
+        before = matmul(eye[..., :2], self.normal) - self.offset_m
+        behind = self.offset_m - matmul(points[:, :2], self.normal)
+        share = np.where((before > 0.0) & (behind > 0.0), before / np.maximum(before + behind, 1e-9), 1.0)
+        place = eye + share[:, None] * (points - eye)
+        along = place[:, 0] * self.normal[1] - place[:, 1] * self.normal[0]
+        inside = (along > self.span[0]) & (along < self.span[1]) & (place[:, 2] > self.heights[0]) & (place[:, 2] < self.heights[1])
+        return np.asarray(share), np.asarray(inside & (share < 1.0))
+
+
+@dataclass(frozen=True)
+class UprightReadings:
+    """Readings of upright surfaces of a storey: points (n, 3), normals (n, 3), the views (n,) that show them, and where all views are (v, 3);
+    the keys (k,) of the voxels in which there are any, in order, and the number (n,) of each reading's."""
+
+    points: F64
+    normals: F64
+    rows: I32
+    eyes: F64
+    keys: I64
+    voxels: I32
+
+
+@dataclass(frozen=True)
+class Crossing:
+    """Readings whose rays cross a line on the plan: where along it (n,) and at which heights (n,), what each counts for (n,), and if it repeats (n,),
+    reflected, what is before the line and is nothing that was read from behind it."""
+
+    along: F64
+    height: F64
+    weight: F64
+    repeats: Bool
+
+
+def upright_readings(evidence: Evidence, storey: Storey) -> UprightReadings:
+    """Select every EVERY-th reading of an upright surface."""
+    upright = (np.abs(evidence.normals[:, 2]) < np.sin(np.radians(UPRIGHT_DEG))) & (evidence.points[:, 2] > storey.bottom_m)
+    chosen = np.nonzero(upright)[0][::EVERY]
+    points, normals = evidence.points[chosen], evidence.normals[chosen]
+    keys, voxels = np.unique(_voxels(points, normals), return_inverse=True)
+    return UprightReadings(points, normals, evidence.rows[chosen], np.array([T[:3, 3] for T in evidence.poses]), keys, voxels.astype(np.int32))
+
+
+def mirrors_of(faces: list[Face], readings: UprightReadings, storey: Storey) -> list[Mirror]:
+    """Find the stretches of faces, high or not, through which most readings repeat what is before them, and that nobody walked through."""
+    found: list[Mirror] = []
+    for face in faces:
+        framed = close_gaps(np.asarray(face.count[:, round(HIGH_M / LEVEL_M) :].any(axis=1), np.bool_), round(WIDEST_M / CELL_M))
+        if longest_run(framed) * CELL_M >= LEAST_FACE_M:
+            found += _mirrors_on(face, framed, _crossing(readings, face, (face.start_m, face.start_m + CELL_M * len(framed))), storey, readings.eyes)
+    return found
+
+
+def _mirrors_on(face: Face, framed: Bool, crossing: Crossing, storey: Storey, eyes: F64) -> list[Mirror]:
+    """Find the mirrors on the columns (k,) of a face that are read high up, or between such columns."""
+    columns = np.clip(np.floor((crossing.along - face.start_m) / CELL_M).astype(int), 0, len(framed) - 1)
+    top = storey.bottom_m + LEVEL_M * (1 + np.nonzero(face.count.any(axis=0))[0][-1])
+    weight = np.where((crossing.height < top) & framed[columns], crossing.weight, 0.0)
+    weights = (np.bincount(columns, each, len(framed)) for each in (weight, weight * crossing.repeats))
+    every, repeated = (sliding_sum(each, np.ones(BROAD)) for each in weights)
+    found = []
+    for a, b in runs_of(np.asarray((repeated > LEAST_SHARE * every) & (every >= LEAST_WEIGHT), np.bool_)):
+        within = (weight > 0.0) & (columns >= a) & (columns < b)
+        span = face.start_m + CELL_M * a - RIM_M, face.start_m + CELL_M * b + RIM_M
+        if (b - a) * CELL_M < NARROWEST_M or not _repeats(crossing, within) or _is_walked_through(face, span, eyes):
+            continue
+        low, high = np.percentile(crossing.height[within], [1.0, 99.0])
+        found.append(Mirror(face.normal, face.offset_m, span, (float(low) - RIM_M, float(high) + RIM_M)))
+    return found
+
+
+def _repeats(crossing: Crossing, chosen: Bool) -> bool | None:
+    """Say if most of the chosen readings repeat what is before the line, those of surfaces that face it if there are some; None for next to none."""
+    facing = chosen & (crossing.weight == 1.0)
+    if facing.sum() >= LEAST_FACING:
+        chosen = facing
+    every = float(crossing.weight[chosen].sum())
+    return float(crossing.weight[chosen & crossing.repeats].sum()) > LEAST_SHARE * every if every >= LEAST_WEIGHT else None
+
+
+def is_reflection(face: Face, span: tuple[float, float], heights: tuple[float, float], readings: UprightReadings) -> bool | None:
+    """Say if what is read through a part of a face is a mirror's: nobody walked through it, and most of it repeats what is before it; None where next
+    to nothing is read that would differ."""
+    if _is_walked_through(face, span, readings.eyes):
+        return False
+    crossing = _crossing(readings, face, span)
+    return _repeats(crossing, np.asarray((crossing.height > heights[0]) & (crossing.height < heights[1]), np.bool_))
+
+
+def _crossing(readings: UprightReadings, face: Face, span: tuple[float, float]) -> Crossing:
+    """Compare the readings through a stretch of the line of a face with those before it and those from behind it. A wall square to the face is no
+    evidence unless the face reaches it: it may go on behind."""
+    points, normals, eyes, normal = readings.points, readings.normals, readings.eyes, face.normal
+    off = matmul(points[:, :2], normal) - face.offset_m
+    away = (matmul(eyes[:, :2], normal) - face.offset_m)[readings.rows]
+    rays = np.nonzero((away > BEFORE_M) & (off < -BEHIND_M))[0]
+    place = eyes[readings.rows[rays]]
+    place = place + (away[rays] / (away[rays] - off[rays]))[:, None] * (points[rays] - place)
+    along = place[:, 0] * normal[1] - place[:, 1] * normal[0]
+    inside = (along > span[0]) & (along < span[1])
+    rays, along, height = rays[inside], along[inside], place[inside, 2]
+    facing, through = matmul(normals[rays, :2], normal), points[rays]
+    reflected, turned = through.copy(), normals[rays].copy()
+    reflected[:, :2] -= 2.0 * off[rays, None] * normal
+    turned[:, :2] -= 2.0 * facing[:, None] * normal
+    repeats = _is_read(reflected, turned, readings, (off > 0.0) & (away > 0.0)) & ~_is_read(through, normals[rays], readings, away < 0.0)
+    column = np.floor((matmul(through[:, :2], face.along) - face.start_m) / CELL_M).astype(int)
+    reached = np.convolve(np.pad(face.count.any(axis=1), REACH), np.ones(2 * REACH + 1), "same") > 0.0
+    met = reached[np.clip(column + REACH, 0, len(reached) - 1)]
+    return Crossing(along, height, np.where(np.abs(facing) > FACING, 1.0, np.where(met, ASIDE_WEIGHT, 0.0)), repeats)
+
+
+def _is_walked_through(face: Face, span: tuple[float, float], eyes: F64) -> bool:
+    """Say if the way of the camera (n, 3) crosses a stretch of the line of a face."""
+    away, along = matmul(eyes[:, :2], face.normal) - face.offset_m, matmul(eyes[:, :2], face.along)
+    crossed = away[:-1] * away[1:] < 0.0
+    return bool((crossed & (along[:-1] > span[0] - ASIDE_M) & (along[:-1] < span[1] + ASIDE_M)).any())
+
+
+def _voxels(points: F64, normals: F64) -> I64:
+    """Return the keys (n,) of the voxels of points (n, 3), with the quarter that their normals (n, 3) look into."""
+    quarter = np.floor((np.arctan2(normals[:, 1], normals[:, 0]) + np.pi / 4.0) / (np.pi / 2.0)).astype(np.int64) % 4
+    cell = np.floor(points / SAME_M).astype(np.int64) + (1 << 15)
+    return np.asarray(((cell[:, 0] << 40) | (cell[:, 1] << 20) | cell[:, 2]) * 4 + quarter)
+
+
+def _is_read(points: F64, normals: F64, readings: UprightReadings, chosen: Bool) -> Bool:
+    """Say of points (n, 3) with normals (n, 3) if any of the chosen readings (m,) is in their voxel, or in one that shares a side with it."""
+    known = np.bincount(readings.voxels[chosen], minlength=len(readings.keys)) > 0
+    keys, out = _voxels(points, normals), np.zeros(len(points), np.bool_)
+    for step in NEIGHBOURS:
+        at = np.minimum(np.searchsorted(readings.keys, keys + step), len(known) - 1)
+        out |= (readings.keys[at] == keys + step) & known[at]
+    return out
+
+
+def without_mirrors(evidence: Evidence, mirrors: list[Mirror]) -> Evidence:
+    """Return the evidence with what mirrors show put where they are."""
+    points, normals, views = evidence.points.copy(), evidence.normals.copy(), list(evidence.views)
+    eyes = np.array([T[:3, 3] for T in evidence.poses])
+    for mirror in mirrors:
+        share, turned = mirror.crossing(eyes[evidence.rows], points)
+        points[turned] = eyes[evidence.rows[turned]] + share[turned, None] * (points[turned] - eyes[evidence.rows[turned]])
+        normals[turned] = [*mirror.normal, 0.0]
+        for row in np.unique(evidence.rows[turned]):
+            views[row] = _view_without(views[row], evidence.poses[row], mirror)
+    return replace(evidence, points=points, normals=normals, views=views)
+
+
+def _view_without(view: KeyframeView, T: F64, mirror: Mirror) -> KeyframeView:
+    """Return a view whose rays end at a mirror."""
+    r, c = np.nonzero(view.depth_m > 0.0)
+    points = view.camera.back_project(np.stack([c, r], axis=1), view.depth_m[r, c].astype(np.float64))
+    share, turned = mirror.crossing(T[:3, 3], matmul(points, T[:3, :3].T) + T[:3, 3])
+    depth = view.depth_m.copy()
+    depth[r[turned], c[turned]] = (share * view.depth_m[r, c])[turned]
+    return replace(view, depth_m=depth)
