@@ -228,7 +228,7 @@ class _Inputs:
     def check(self, kind: type[Any]) -> None:
         """Raise UsageError where neither an input of the stage's plugin nor the images that it is computed from are given."""
         slot, hints = self._stage.slot, inputs_of(self._stage.slot)
-        missing = {name: images for name in parameters_of_method(slot, kind) if (images := self._missing_images(slot, name))}
+        missing = {name: lacking for name in parameters_of_method(slot, kind) if (lacking := self._missing_images(slot, name))}
         if "rgb" in missing.get("frame", ()):
             raise UsageError(f"{self._place}: rgb", f"is not given, and {slot} are found in it", "give rgb (h, w, 3) before depth")
         if "frame" in missing:
