@@ -12,6 +12,7 @@ import trihedron as th
 from trihedron.datasets.simulation.synthetic import Synthetic
 from trihedron.pipeline.core import types
 from trihedron.pipeline.record import reader
+from trihedron.stages import IMAGES
 
 LENGTH = 24
 SMALL = {"width": 160, "height": 120}
@@ -305,14 +306,31 @@ def test_a_stage_alone_says_what_it_computes_besides(folder, camera, capsys):
         (lambda d, c: th.keypoints.orb()(d, c), "keypoints.orb: rgb: is not given, and keypoints are found in it; give rgb (h, w, 3) before depth"),
         (lambda d, c: th.planes.ransac()(d), "planes.ransac: camera: is not given; give trihedron.Camera(...) after the images"),
         (lambda d, c: th.planes.ransac()(c), "planes.ransac: depth: is not given; give depth (h, w) and a camera, or a frame"),
+        (
+            lambda d, c: th.manhattan.branch_and_bound()(),
+            f"manhattan.branch_and_bound: lacks normals, segments, planes, and has no rgb, depth, camera to compute from; give {IMAGES}, "
+            "or by name normals=Normals, segments=Segments, planes=Planes",
+        ),
+        (
+            lambda d, c: th.manhattan.branch_and_bound()(d, c),
+            f"manhattan.branch_and_bound: lacks segments, and has no rgb to compute from; give {IMAGES}, or by name segments=Segments",
+        ),
         (lambda d, c: th.surface.tsdf()(d, c), 'surface.tsdf: gathers many frames; give Slam(..., surface="tsdf", outputs=["surface"])'),
     ],
 )
-def test_mistakes_with_a_stage(folder, camera, call, message):
+def test_mistakes_with_a_stage(folder, camera, call, message, capsys):
     _, depth, _ = next(images(folder))
     with pytest.raises(th.TrihedronError) as error:
         call(depth, camera)
     assert str(error.value) == message
+    assert capsys.readouterr().err == ""  # nothing is announced that is not computed then
+
+
+def test_help_of_a_stage_names_its_inputs():
+    called = f"The stage is called on {IMAGES}; by name on any of: normals=Normals, segments=Segments, planes=Planes, previous=ManhattanFrame."
+    assert called in th.manhattan.branch_and_bound.__doc__ and called in th.manhattan.branch_and_bound().__doc__
+    assert f"The stage is called on {IMAGES}." in th.lines.lsd.__doc__
+    assert "is called on" not in th.surface.tsdf.__doc__ + th.dataset.synthetic.__doc__
 
 
 @pytest.mark.slow

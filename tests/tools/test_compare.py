@@ -184,6 +184,20 @@ def test_a_folder_without_runs(tmp_path, capsys):
     assert capsys.readouterr().err == f"trihedron: {tmp_path}: holds no runs; {cure}\n"
 
 
+def test_a_folder_that_does_not_exist(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for word, place in (("runs/nope", f"does not exist in {tmp_path}"), (f"{tmp_path}/nope", "does not exist")):
+        assert main(["compare", word]) == 1
+        assert capsys.readouterr().err == f"trihedron: {word}: {place}; give the out=FOLDER of a run or of a sweep\n"
+
+
+def test_a_trajectory_without_a_run_to_compare_it_with(tmp_path, capsys):
+    (tmp_path / "orbslam2.txt").write_text("0 0 0 0 0 0 0 1\n")
+    assert main(["compare", str(tmp_path / "orbslam2.txt")]) == 2
+    cure = "give the folder of a run of the same data set before them"
+    assert capsys.readouterr().err == f"trihedron: compare: there are trajectories and no run; {cure}\n"
+
+
 def composed(*overrides):
     load_plugins()
     register_configs()
