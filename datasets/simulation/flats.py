@@ -106,7 +106,7 @@ def whole_floor() -> Building:
 _STAIRWELL = (20.1, 23.4, 0.0, 7.2)  # at the end of the corridor
 _AISLE = (20.1, 22.2, 0.0, 7.2)  # of it, beside the stairs
 _HOLE = ((22.3, 23.4), (1.2, 4.9))  # in the slab: x, y
-_FOOT, _HEAD = (22.9, 0.5), (22.9, 5.6)  # before and behind the flight
+_FOOT, _HEAD = (22.9, 0.7), (22.9, 5.6)  # before and behind the flight
 
 
 def _upper_plan(rng: np.random.Generator, width: float, depth: float) -> tuple[list[Rectangle], list[_Partition]]:
@@ -126,7 +126,7 @@ def _stairwell(width: float, depth: float) -> list[Solid]:
     parapet = (UPPER_M, UPPER_M + 0.9)
     solids += [box((west - 0.04, west), (south, north), parapet, "plastic"), box((west - 0.04, east), (south - 0.04, south), parapet, "plastic")]
     to_south, to_east, to_north, to_west = walls_of(rectangle(_STAIRWELL[:2], _STAIRWELL[2:]))
-    solids += furniture_along(to_south, "picture 1.2") + furniture_along(to_north, "portrait 0.6, locker 1.8, picture 2.8")
+    solids += furniture_along(to_south, "picture 1.2, portrait 2.7") + furniture_along(to_north, "portrait 0.6, locker 1.8, picture 2.8")
     solids += furniture_along(to_west, "portrait 3.0, picture 4.4, portrait 6.0") + furniture_along(to_east, "picture 6.0")
     upper = furniture_along(to_south, "portrait 0.7, picture 2.3") + furniture_along(to_north, "picture 0.8, cabinet 2.2, portrait 2.2")
     return solids + [lift_to_upper_floor(solid) for solid in upper + furniture_along(to_east, "picture 1.9, portrait 3.4, picture 4.8, portrait 6.3")]

@@ -32,7 +32,7 @@ from trihedron.pipeline.core.types import EXACT_DEPTH, F32, F64, I32, U8, Bool, 
 class Scene(Enum):
     """Scene that the camera is in: one furnished room, a corridor that ends where it began, two identical offices on a corridor, ten rooms in a
     circuit, an L-shaped flat, two rooms with slanted walls, two storeys joined by stairs, a furnished flat drawn by its number, a
-    floor of eight furnished rooms on a corridor."""
+    floor of eight furnished rooms on a corridor with a stair to two more."""
 
     room = "room"
     corridor = "corridor"

@@ -76,13 +76,19 @@ def test_a_flat_of_a_number_is_whole_and_its_walk_is_clear(number: int) -> None:
     assert again.walk == building.walk and len(again.room.solids) == len(building.room.solids)
 
 
-def test_a_whole_floor_has_eight_rooms_on_a_corridor() -> None:
-    (plan,) = Synthetic(scene=Scene.whole_floor).plans()
+def test_a_whole_floor_has_eight_rooms_on_a_corridor_and_two_upstairs() -> None:
+    """A stairwell at the end of the corridor leads to a landing; the walk shows every room, and every storey for itself."""
+    ground, upper = Synthetic(scene=Scene.whole_floor).plans()
     building = whole_floor()
-    assert (len(plan.rooms), len(plan.doorways)) == (9, 8)
+    assert [(len(plan.rooms), len(plan.doorways)) for plan in (ground, upper)] == [(10, 9), (3, 3)]
+    assert (ground.floor_m, ground.ceiling_m, upper.floor_m, upper.ceiling_m) == pytest.approx((0.0, 2.7, 3.0, 5.7))
     places = np.array([building.walk.pose(0, t)[:3, 3] for t in np.linspace(0.0, building.walk.duration_s, 1000)])
-    assert building.walk.length_m == pytest.approx(179.8, abs=0.1) and clearance_m(building, places) > 0.1
-    assert all(shapely.contains_xy(shapely.Polygon(room[0], room[1:]), *places[:, :2].T).any() for room in plan.rooms)
+    assert building.walk.length_m == pytest.approx(261.8, abs=0.1) and clearance_m(building, places) > 0.1
+    for plan in (ground, upper):
+        there = places[np.abs(places[:, 2] - plan.floor_m - 1.45) < 0.2, :2]
+        assert all(shapely.contains_xy(shapely.Polygon(room[0], room[1:]), *there.T).any() for room in plan.rooms)
+    again = whole_floor()
+    assert again.walk == building.walk and [s.centre.tolist() for s in again.room.solids] == [s.centre.tolist() for s in building.room.solids]
 
 
 def test_a_number_is_for_random_flats_alone() -> None:
