@@ -121,13 +121,17 @@ def test_frames_have_depth_and_none_beyond_the_sensor(scene: tuple[Scene, Buildi
     np.testing.assert_array_equal(truth.poses[number], scene[1].walk.pose(0, number / 30))
 
 
-def test_the_offices_cannot_be_told_apart() -> None:
+@pytest.mark.parametrize(
+    ("name", "place", "shift"), [(Scene.offices, (3.4, 2.8, 1.4), (6.8, 0.0, 0.0)), (Scene.storeys, (2.9, 4.2, 1.4), (0.0, 0.0, 3.0))]
+)
+def test_offices_and_storeys_cannot_be_told_apart(name: Scene, place: tuple[float, ...], shift: tuple[float, ...]) -> None:
     """The same view in both, but for the rounding of a few samples on edges."""
-    room = BUILDINGS[Scene.offices]().room
+    room = BUILDINGS[name]().room
     geometry, atlas = geometry_of(room), bake(all_faces(room), True, 0, 0.1)
-    pose = np.array([[1.0, 0.0, 0.0, 3.4], [0.0, 0.0, 1.0, 2.8], [0.0, -1.0, 0.0, 1.4], [0.0, 0.0, 0.0, 1.0]])  # north, from the door
+    pose = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])  # north
+    pose[:3, 3] = place
     other = pose.copy()
-    other[0, 3] += 6.8
+    other[:3, 3] += shift
     (color, depth, _, _), (color2, depth2, _, _) = (render(geometry, atlas, CAMERA, T) for T in (pose, other))
     difference = np.abs(color.astype(int) - color2)
     assert (difference <= 1).mean() > 0.995 and difference.mean() < 0.05 and np.ptp(color) > 100
