@@ -10,7 +10,8 @@ from trihedron.plugins.loop.manhattan_prior import estimate_axes
 from trihedron.plugins.mapping.covisibility_graph import observed_by
 from trihedron.plugins.mapping.landmark_kinds import PLANE, observed_rows
 
-STOREY_M = 2.4  # least from floor to floor; and no camera is as high above the floor it is carried over
+STOREY_M = 2.4  # least from floor to floor
+EYE_M = (1.2, 2.4)  # of a camera in the hand above the floor; what is nearer is furniture or a step, what is farther another storey
 LEVEL_COS = float(np.cos(np.radians(10.0)))  # of a floor's normal and the vertical
 
 
@@ -47,14 +48,14 @@ def _vertical(map: Map, keyframes: I32) -> F64 | None:
 
 
 def _eye_heights_m(map: Map, keyframes: I32, up: F64) -> F64 | None:
-    """Return the height (k,) of each camera above the lowest level plane it observed within a storey below; where none is in view, as high as the
-    camera was carried before."""
+    """Return the height (k,) of each camera above the floor that it observed, the lowest of several; where none is in view, as high as the camera was
+    carried before. None without a floor."""
     _, planes, counts = observed_rows(map, keyframes, PLANE)
     observer = np.repeat(np.arange(len(keyframes)), counts)
     coefficients, positions = map.planes.rows("coefficients", planes), map.keyframes.rows("T_world_camera", keyframes)[observer, :3, 3]
     cosine = matmul(coefficients[:, :3], up)
     above = ((coefficients[:, :3] * positions).sum(axis=1) + coefficients[:, 3]) / np.maximum(cosine, LEVEL_COS)
-    floor = map.planes.rows("alive", planes) & (cosine > LEVEL_COS) & (above > 0.0) & (above < STOREY_M)
+    floor = map.planes.rows("alive", planes) & (cosine > LEVEL_COS) & (above > EYE_M[0]) & (above < EYE_M[1])
     highest = np.zeros(len(keyframes))
     np.maximum.at(highest, observer[floor], above[floor])
     known = np.flatnonzero(highest)
