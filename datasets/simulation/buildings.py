@@ -140,24 +140,19 @@ def house() -> Building:
     footprint = rectangle((0.0, x), (0.0, y))
     planes, faces = shell(footprint, top)
     divide = _doorway(False, (4.0, 4.1), (0.0, y), 2.0)
-    solids = [*divide, *(_lift_to_upper_floor(solid) for solid in _doorway(False, (4.0, 4.1), (0.0, y), 4.2))]
+    solids = [*divide, *(lift_to_upper_floor(solid) for solid in _doorway(False, (4.0, 4.1), (0.0, y), 4.2))]
     hole = ((0.0, 1.1), (0.9, 4.5))
-    for part in (((1.1, x), (0.0, y)), ((0.0, 1.1), (0.0, 0.9)), ((0.0, 1.1), (4.5, y))):
-        solids += [box(*part, (HEIGHT_M, UPPER_M - 0.004), "ceiling"), box(*part, (UPPER_M - 0.004, UPPER_M), "floor")]
-    rise, going = UPPER_M / STEPS, (hole[1][1] - 0.6) / STEPS
-    for step in range(STEPS - 1):
-        begin = 0.6 + going * step
-        solids.append(box((0.0, 1.0), (begin, begin + going), (max(rise * (step - 1), 0.0), rise * (step + 1)), "wood"))
+    solids += [*slab_around((0.0, x), (0.0, y), hole), *flight((0.0, 1.0), (0.6, hole[1][1]))]
     solids += [box((1.1, 1.14), (0.9, 4.5), (UPPER_M, UPPER_M + 0.9), "plastic"), box((0.0, 1.14), (0.86, 0.9), (UPPER_M, UPPER_M + 0.9), "plastic")]
     south, east, north, west = walls_of(footprint)
     solids += furniture_along(south, "cabinet 2.4, picture 2.4, sofa 5.6, picture 5.6") + furniture_along(east, "shelf 1.5, picture 3.2, desk 4.8")
     solids += furniture_along(north, "locker 1.2, picture 2.4, portrait 4.4, picture 5.8") + furniture_along(west, "portrait 0.8")
-    solids += [_lift_to_upper_floor(solid) for solid in furniture_along(south, "picture 2.2, portrait 3.2, desk 5.6, picture 5.6")]
+    solids += [lift_to_upper_floor(solid) for solid in furniture_along(south, "picture 2.2, portrait 3.2, desk 5.6, picture 5.6")]
     solids += [
-        _lift_to_upper_floor(solid)
+        lift_to_upper_floor(solid)
         for solid in furniture_along(east, "picture 1.2, shelf 3.0, portrait 4.8") + furniture_along(west, "portrait 0.6, picture 3.4")
     ]
-    solids += [_lift_to_upper_floor(solid) for solid in furniture_along(north, "cabinet 1.4, picture 1.4, picture 4.6, portrait 6.2")]
+    solids += [lift_to_upper_floor(solid) for solid in furniture_along(north, "cabinet 1.4, picture 1.4, picture 4.6, portrait 6.2")]
     low, low_lights = lamps_at([(2.5, 3.0), (5.5, 3.0)])
     high, high_lights = lamps_at([(2.5, 3.0), (5.5, 3.0)], top)
     room = Room(planes, faces, (*solids, *low, *high), (*low_lights, *high_lights), DETAIL, ((0.0, HEIGHT_M), (UPPER_M, top)))
@@ -168,7 +163,50 @@ def house() -> Building:
     return Building(room, Walk(tuple(path), 0.55, 0.5, tuple(floors)))
 
 
-def _lift_to_upper_floor(solid: Solid) -> Solid:
+def storeys() -> Building:
+    """Two storeys with the same two rooms, joined by stairs: but for these, and the light on low furniture, one storey looks as the other.
+    The walk goes round both."""
+    x, y, top = 7.0, 6.0, UPPER_M + HEIGHT_M
+    footprint = rectangle((0.0, x), (0.0, y))
+    planes, faces = shell(footprint, top)
+    south, east, north, west = walls_of(footprint)
+    storey = _doorway(False, (4.0, 4.1), (0.0, y), 2.6)
+    storey += [wall.mount_box(wall.length_m / 2.0, (0.0, HEIGHT_M), wall.length_m, 0.02, "wall") for wall in (south, east, north, west)]
+    for part in ((1.14, 4.0), (4.1, x)):
+        storey += [box(part, (0.0, y), (0.0, 0.004), "floor"), box(part, (0.0, y), (HEIGHT_M - 0.004, HEIGHT_M), "ceiling")]
+    storey += furniture_along(south, "cabinet 2.4, picture 2.4, sofa 5.6, picture 5.6") + furniture_along(west, "portrait 0.6, picture 3.4")
+    storey += furniture_along(east, "shelf 1.5, picture 3.2, desk 4.8") + furniture_along(north, "locker 1.2, picture 2.4, portrait 4.4, picture 5.8")
+    hanging, lights = lamps_at([(2.5, 3.0), (5.5, 3.0)])
+    storey = [_looking(solid, number) for number, solid in enumerate([*storey, *hanging])]
+    hole = ((0.0, 1.1), (0.9, 4.5))
+    solids = [*storey, *map(lift_to_upper_floor, storey), *slab_around((0.0, x), (0.0, y), hole), *flight((0.0, 1.0), (0.6, hole[1][1]))]
+    solids += [box((1.1, 1.14), (0.9, 4.5), (UPPER_M, UPPER_M + 0.9), "plastic"), box((0.0, 1.14), (0.86, 0.9), (UPPER_M, UPPER_M + 0.9), "plastic")]
+    room = Room(planes, faces, tuple(solids), (*lights, *((a, b, c + UPPER_M) for a, b, c in lights)), DETAIL, ((0.0, HEIGHT_M), (UPPER_M, top)))
+    tour = [(1.8, 4.8), (3.2, 2.6), (4.9, 2.6), (5.8, 1.5), (6.1, 3.6), (5.2, 4.6), (4.9, 2.6), (3.2, 2.6)]
+    path = [*tour, (2.0, 1.2), (0.5, 0.35), (0.5, 0.6), (0.5, 4.5), (0.5, 5.1), *tour, (2.2, 4.4)]
+    path += [(0.5, 5.1), (0.5, 4.5), (0.5, 0.6), (0.5, 0.35), (1.9, 0.8)]
+    floors = [0.0] * (len(tour) + 3) + [UPPER_M] * (len(tour) + 5) + [0.0] * 3
+    return Building(room, Walk(tuple(path), 0.55, 0.5, tuple(floors)))
+
+
+def slab_around(x: tuple[float, float], y: tuple[float, float], hole: tuple[tuple[float, float], tuple[float, float]]) -> list[Solid]:
+    """The slab under the upper floor, ceiling below and floor above, but for a hole (x, y)."""
+    (west, east), (south, north) = hole
+    solids = list[Solid]()
+    for part in (((east, x[1]), y), ((x[0], west), y), ((west, east), (y[0], south)), ((west, east), (north, y[1]))):
+        if all(end > begin for begin, end in part):
+            solids += [box(*part, (HEIGHT_M, UPPER_M - 0.004), "ceiling"), box(*part, (UPPER_M - 0.004, UPPER_M), "floor")]
+    return solids
+
+
+def flight(x: tuple[float, float], y: tuple[float, float]) -> list[Solid]:
+    """A straight flight of stairs that climbs along y from the ground to the upper floor, open below."""
+    rise, going = UPPER_M / STEPS, (y[1] - y[0]) / STEPS
+    begins = [y[0] + going * step for step in range(STEPS - 1)]
+    return [box(x, (y0, y0 + going), (max(rise * (k - 1), 0.0), rise * (k + 1)), "wood") for k, y0 in enumerate(begins)]
+
+
+def lift_to_upper_floor(solid: Solid) -> Solid:
     """Return a solid as it stands on the upper floor."""
     shift = UPPER_M * UP
     return replace(solid, centre=solid.centre + shift, faces=tuple(replace(face, origin=face.origin + shift) for face in solid.faces))

@@ -4,16 +4,27 @@ What plans get wrong stands in them: wardrobes of 1.8 m to 2.4 m, shelves, curta
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
-from trihedron.datasets.simulation.buildings import DETAIL, DOORWAY_M, Building, lamps_at, rectangle, wall_with_gaps
-from trihedron.datasets.simulation.furniture import PIECES
+from trihedron.datasets.simulation.buildings import (
+    DETAIL,
+    DOORWAY_M,
+    UPPER_M,
+    Building,
+    flight,
+    lamps_at,
+    lift_to_upper_floor,
+    rectangle,
+    slab_around,
+    wall_with_gaps,
+)
+from trihedron.datasets.simulation.furniture import PIECES, furniture_along
 from trihedron.datasets.simulation.motion import Sway
-from trihedron.datasets.simulation.room import HEIGHT_M, UP, Face, Glass, Pane, Room, Solid, Wall, pane_before, shell, turned_box, walls_of
+from trihedron.datasets.simulation.room import HEIGHT_M, UP, Room, Solid, Wall, box, shell, turned_box, walls_of
 from trihedron.datasets.simulation.walks import Walk
 from trihedron.pipeline.core.linalg import matmul, norm
 from trihedron.pipeline.core.types import F64
@@ -24,7 +35,6 @@ AISLE_M = 2.2  # a narrower room is walked along its middle
 STEP_M = 0.6  # before and behind a door, where the path is square to it
 SPEED_M_S, LOOK_AHEAD_M = 0.5, 0.5
 GAZE_DEG = Sway((14.0, 10.0, 2.0), (7.3, 5.7, 4.9))  # yaw, pitch, roll: who scans a flat looks up and down
-WARDROBE_M, WINDOW_WIDE_M, PORTRAIT_WIDE_M = 1.7, 1.2, 0.6  # by which fronts of wardrobes, windows and portraits are known
 LEAST_SHARED_M = DOORWAY_M[0] + 2.0 * JAMB_M  # of a wall between two rooms, for a door
 
 
@@ -65,93 +75,104 @@ def random_flat(number: int) -> Building:
     return _furnished(rng, (width, depth), rooms, partitions, _doors(rng, rooms, partitions))
 
 
-def glazed_flat(number: int) -> Building:
-    """Make flat `number` with mirrors on doors of wardrobes, in frames of pictures and from the floor up, glass in its windows, and windows between rooms."""
-    flat, rng = random_flat(number), np.random.default_rng([number, 47])
-    solids, panes = list[Solid](), list[Pane]()
-    for solid in flat.room.solids:
-        window = _window_in(rng, solid, flat.room.solids)
-        solids += window[0] if window else [solid]
-        panes += window[1] if window else []
-    solids = [solid for solid in solids if not any(_hangs_over(solid, pane) for pane in panes)]
-    for front in (face for solid in solids for face in solid.faces):
-        width, height = front.size_m
-        if front.material == "drawers" and height > WARDROBE_M and rng.uniform() < 0.6:
-            panes.append(_mirror_door(front, rng.uniform() < 0.5))
-        elif front.material == "picture" and width > WINDOW_WIDE_M:
-            panes.append(pane_before(front, Glass.outer))
-        elif front.material == "picture" and width < PORTRAIT_WIDE_M and rng.uniform() < 0.25:
-            panes.append(_standing_mirror(front))
-        elif front.material == "picture" and rng.uniform() < 0.15:
-            panes.append(pane_before(front, Glass.mirror))
-    return replace(flat, room=replace(flat.room, solids=tuple(solids), panes=tuple(panes)))
-
-
-def _hangs_over(solid: Solid, pane: Pane) -> bool:
-    """Say if a picture hangs where there is a window now."""
-    away = np.abs(matmul(np.stack([pane.u, pane.normal]), solid.centre - pane.origin - pane.u * pane.size_m[0] / 2.0))
-    return any(face.material == "picture" for face in solid.faces) and bool(away[0] < pane.size_m[0] / 2.0 + solid.half[0] and away[1] < 0.15)
-
-
-def _mirror_door(face: Face, left: bool) -> Pane:
-    """Make the mirror on one of the two doors of a wardrobe."""
-    pane = pane_before(face, Glass.mirror)
-    half = pane.size_m[0] / 2.0
-    return replace(pane, origin=pane.origin + (0.0 if left else half) * pane.u, size_m=(half, pane.size_m[1]))
-
-
-def _standing_mirror(face: Face) -> Pane:
-    """Make a mirror of 0.7 m from near the floor to above one's head, where a portrait hangs."""
-    wide, bottom, top = 0.7, 0.1, 1.95
-    middle = face.origin + face.u * face.size_m[0] / 2.0 + 0.005 * face.normal
-    return Pane(Glass.mirror, middle - face.u * wide / 2.0 + UP * (top - middle[2]), face.u, face.v, face.normal, (wide, top - bottom))
-
-
-def _window_in(rng: np.random.Generator, wall: Solid, others: tuple[Solid, ...]) -> tuple[list[Solid], list[Pane]] | None:
-    """Return a partition with a window of 1 m by 1.1 m in its middle instead, and its pane, where nothing stands or hangs there; else None."""
-    long = int(np.argmax(wall.half[:2]))
-    length, thick = 2.0 * float(wall.half[long]), 2.0 * float(wall.half[1 - long])
-    partition = all(face.material == "wall" for face in wall.faces) and 1.6 < length and thick < 0.2 and wall.half[2] * 2.0 > HEIGHT_M - 1e-6
-    if not partition or rng.uniform() < 0.3:
-        return None
-    along, across = wall.R_world_solid[:, long], wall.R_world_solid[:, 1 - long]
-    standing = [solid for solid in others if min(solid.half[:2]) > 0.02 and solid is not wall]
-    near = np.abs(matmul(np.array([solid.centre - wall.centre for solid in standing]), np.stack([along, across], axis=1)))
-    reach = np.array([float(norm(solid.half[:2])) for solid in standing])
-    if ((near[:, 0] < 0.6 + reach) & (near[:, 1] < 0.2 + reach) & (reach < length / 2.0)).any():
-        return None
-    wide, bottom, top = 1.0, 0.9, 2.0
-    ends = wall.centre[:2] + np.array([[-0.5], [0.5]]) * length * along[:2]
-    solids = wall_with_gaps((ends[0, 0], ends[0, 1]), (ends[1, 0], ends[1, 1]), [(length / 2.0, wide, bottom, top)], thick)
-    corner = np.array([*wall.centre[:2], 0.0]) - along * wide / 2.0 + UP * top
-    return solids, [Pane(Glass.inner, corner, along, -UP, across, (wide, top - bottom))]
-
-
 def whole_floor() -> Building:
-    """Make a floor of eight furnished rooms along a corridor of 20 m; the walk goes through all of them and comes back to where it began."""
+    """Make a floor of eight furnished rooms along a corridor of 20 m, and a stairwell at its end with two more rooms upstairs; the walk goes through
+    all of them and comes back to where it began."""
     rng = np.random.default_rng([0, 43])
     width, depth = 20.0, 11.6
     rooms, partitions = _floor_plan(rng, width, depth)
     doors = _all_doors(rng, rooms, partitions)
     north, south = (sorted((door for door in doors if (door.a == 0) == there), key=lambda door: float(door.middle[0])) for there in (True, False))
-    return _furnished(rng, (width, depth), rooms, partitions, [*north, *south[::-1]])
+    stairs_rng = np.random.default_rng([1, 43])
+    rooms, partitions = [*rooms, _AISLE], [*partitions, _Partition((width + 0.05, 0.0), (width + 0.05, depth), 0.1)]
+    to_stairs = [_hang_door(stairs_rng, shared) for shared in _shared_walls(rooms, partitions) if (shared.a, shared.b) == (0, len(rooms) - 1)]
+    doors = [*north, *to_stairs, *south[::-1]]
+    around = _path(rooms, doors)
+    solids = _interior(rng, (width, depth), rooms[:-1], partitions, doors, around)
+
+    upper_rooms, upper_partitions = _upper_plan(stairs_rng, width, depth)
+    upper_doors = _doors(stairs_rng, upper_rooms, upper_partitions)
+    upstairs = _path(upper_rooms, upper_doors, len(upper_rooms) - 1, np.array(_HEAD))
+    above = _interior(stairs_rng, (width, depth), upper_rooms[:-1], upper_partitions, upper_doors, upstairs)
+    solids += [*map(lift_to_upper_floor, above), *_stairwell(width, depth)]
+    top = UPPER_M + HEIGHT_M
+    planes, faces = shell(rectangle((0.0, _STAIRWELL[1]), (0.0, depth)), top)
+    lamps, lights = lamps_at([_middle(room) for room in rooms])
+    upper_lamps, upper_lights = lamps_at([_middle(room) for room in upper_rooms], top)
+    room = Room(planes, faces, (*solids, *lamps, *upper_lamps), (*lights, *upper_lights), DETAIL, ((0.0, HEIGHT_M), (UPPER_M, top)))
+    return Building(room, _climb(around, upstairs))
+
+
+_STAIRWELL = (20.1, 23.4, 0.0, 7.2)  # at the end of the corridor
+_AISLE = (20.1, 22.2, 0.0, 7.2)  # of it, beside the stairs
+_HOLE = ((22.3, 23.4), (1.2, 4.9))  # in the slab: x, y
+_FOOT, _HEAD = (22.9, 0.7), (22.9, 5.6)  # before and behind the flight
+
+
+def _upper_plan(rng: np.random.Generator, width: float, depth: float) -> tuple[list[Rectangle], list[_Partition]]:
+    """Lay two rooms over the east end of the floor, beside the landing, which comes last."""
+    west, cut = 14.6, _Partition((14.6, level := _between(rng, 0.4 * depth, 0.46 * depth)), (width, level), _thickness(rng))
+    rooms = [(west, width, 0.0, level - cut.depth_m / 2.0), (west, width, level + cut.depth_m / 2.0, depth), _AISLE]
+    return rooms, [cut, _Partition((width + 0.05, 0.0), (width + 0.05, depth), 0.1)]
+
+
+def _stairwell(width: float, depth: float) -> list[Solid]:
+    """Build the stairs, the slab between the storeys, and what no room is made of on either; hang pictures."""
+    (west, east), (south, north) = _HOLE
+    solids = [box((width + 0.1, _STAIRWELL[1]), (_STAIRWELL[3], depth), (0.0, HEIGHT_M), "wall")]
+    solids.append(lift_to_upper_floor(solids[0]))
+    solids.append(lift_to_upper_floor(box((0.0, 14.6), (0.0, depth), (0.0, HEIGHT_M), "wall")))
+    solids += [*slab_around((0.0, east), (0.0, depth), _HOLE), *flight((west + 0.1, east), (_FOOT[1] + 0.5, north))]
+    parapet = (UPPER_M, UPPER_M + 0.9)
+    solids += [box((west - 0.04, west), (south, north), parapet, "plastic"), box((west - 0.04, east), (south - 0.04, south), parapet, "plastic")]
+    to_south, to_east, to_north, to_west = walls_of(rectangle(_STAIRWELL[:2], _STAIRWELL[2:]))
+    solids += furniture_along(to_south, "picture 1.2, portrait 2.7") + furniture_along(to_north, "portrait 0.6, locker 1.8, picture 2.8")
+    solids += furniture_along(to_west, "portrait 3.0, picture 4.4, portrait 6.0") + furniture_along(to_east, "picture 6.0")
+    upper = furniture_along(to_south, "portrait 0.7, picture 2.3") + furniture_along(to_north, "picture 0.8, cabinet 2.2, portrait 2.2")
+    return solids + [lift_to_upper_floor(solid) for solid in upper + furniture_along(to_east, "picture 1.9, portrait 3.4, picture 4.8, portrait 6.3")]
+
+
+def _climb(around: tuple[tuple[float, float], ...], upstairs: tuple[tuple[float, float], ...]) -> Walk:
+    """Walk a closed path of the ground floor and, from where it is next to the stairs, up and round the upper floor."""
+    near = int(np.argmin([norm(np.subtract(point, _FOOT)) for point in around])) + 1
+    begin, end = (_FOOT[0], _FOOT[1] + 0.5), (_HEAD[0], _HOLE[1][1])  # of the flight
+    path = [*around[:near], _FOOT, begin, end, _HEAD, *upstairs, upstairs[0], _HEAD, end, begin, _FOOT, *around[near - 1 :]]
+    floors = [0.0] * (near + 2) + [UPPER_M] * (len(upstairs) + 5) + [0.0] * (len(around) - near + 3)
+    return Walk(tuple(path), SPEED_M_S, LOOK_AHEAD_M, tuple(floors), GAZE_DEG)
 
 
 def _furnished(
     rng: np.random.Generator, size: tuple[float, float], rooms: list[Rectangle], partitions: list[_Partition], doors: list[_Door]
 ) -> Building:
-    """Put walls, niches, furniture and door leaves into rooms, and walk through them."""
+    """Make a flat of one storey, and walk through its rooms."""
     width, depth = size
     path = _path(rooms, doors)
+    solids = _interior(rng, size, rooms, partitions, doors, path)
+    planes, faces = shell(rectangle((0.0, width), (0.0, depth)))
+    hanging, lights = lamps_at([_middle(room) for room in rooms])
+    return Building(Room(planes, faces, (*solids, *hanging), lights, DETAIL), Walk(path, SPEED_M_S, LOOK_AHEAD_M, gaze_deg=GAZE_DEG))
+
+
+def _interior(
+    rng: np.random.Generator,
+    size: tuple[float, float],
+    rooms: list[Rectangle],
+    partitions: list[_Partition],
+    doors: list[_Door],
+    path: tuple[tuple[float, float], ...],
+) -> list[Solid]:
+    """Return the walls between rooms, and niches, furniture and door leaves that leave a path free."""
     solids = [solid for wall in partitions for solid in _partition_solids(wall)]
     for room in rooms:
-        solids += _niche(rng, room, (width, depth), path) if rng.uniform() < 0.3 else []
+        solids += _niche(rng, room, size, path) if rng.uniform() < 0.3 else []
     for number_of_room, room in enumerate(rooms):
         solids += _furniture(rng, room, [door for door in doors if number_of_room in (door.a, door.b)], path, solids)
-    solids += [solid for door in doors if rng.uniform() < 0.4 for solid in _leaf(rng, door, path)]
-    planes, faces = shell(rectangle((0.0, width), (0.0, depth)))
-    hanging, lights = lamps_at([((west + east) / 2.0, (south + north) / 2.0) for west, east, south, north in rooms])
-    return Building(Room(planes, faces, (*solids, *hanging), lights, DETAIL), Walk(path, SPEED_M_S, LOOK_AHEAD_M, gaze_deg=GAZE_DEG))
+    return solids + [solid for door in doors if rng.uniform() < 0.4 for solid in _leaf(rng, door, path)]
+
+
+def _middle(room: Rectangle) -> tuple[float, float]:
+    west, east, south, north = room
+    return (west + east) / 2.0, (south + north) / 2.0
 
 
 def _between(rng: np.random.Generator, low: float, high: float) -> float:
@@ -276,13 +297,13 @@ def _partition_solids(wall: _Partition) -> list[Solid]:
     return wall_with_gaps(wall.start, wall.end, [(at, DOORWAY_M[0], 0.0, DOORWAY_M[1]) for at in wall.doors], wall.depth_m)
 
 
-def _path(rooms: list[Rectangle], doors: list[_Door]) -> tuple[tuple[float, float], ...]:
-    """Walk through all rooms by their doors and back, round each room once."""
+def _path(rooms: list[Rectangle], doors: list[_Door], first: int = 0, entry: F64 | None = None) -> tuple[tuple[float, float], ...]:
+    """Walk through all rooms by their doors and back, round each room once, beginning in room `first` where it is nearest to `entry` (2,)."""
     points, seen = list[F64](), set[int]()
 
     def visit(room: int) -> None:
         seen.add(room)
-        tour = _tour(rooms[room], points[-1] if points else np.zeros(2))
+        tour = _tour(rooms[room], points[-1] if points else np.zeros(2) if entry is None else entry)
         points.extend(tour)
         for door in doors:
             if room in (door.a, door.b) and (other := door.a + door.b - room) not in seen:
@@ -292,7 +313,7 @@ def _path(rooms: list[Rectangle], doors: list[_Door]) -> tuple[tuple[float, floa
                 points.extend([door.middle + ahead, door.middle - ahead])
         points.append(tour[0] * 0.98 + 0.02 * tour[1])
 
-    visit(0)
+    visit(first)
     apart = [p for p, q in pairwise([*points, points[0]]) if norm(q - p) > 0.05]
     return tuple((float(x), float(y)) for x, y in apart)
 

@@ -14,9 +14,10 @@ from trihedron.datasets.readers.sequence import clip_range
 from trihedron.datasets.simulation import buildings
 from trihedron.datasets.simulation.buildings import Building
 from trihedron.datasets.simulation.depth_noise import KINECT, STEREO, noisy_color, sensed_depth
-from trihedron.datasets.simulation.flats import glazed_flat, random_flat, whole_floor
+from trihedron.datasets.simulation.flats import random_flat, whole_floor
 from trihedron.datasets.simulation.furniture import curved_pieces
 from trihedron.datasets.simulation.glass import look_through
+from trihedron.datasets.simulation.glazed_flats import glazed_flat
 from trihedron.datasets.simulation.motion import Motion, camera_pose
 from trihedron.datasets.simulation.raytracing import Geometry, geometry_of
 from trihedron.datasets.simulation.room import BOX, Room, all_faces, furnished_room
@@ -32,8 +33,8 @@ from trihedron.pipeline.core.types import EXACT_DEPTH, F32, F64, I32, U8, Bool, 
 
 class Scene(Enum):
     """Scene that the camera is in: one furnished room, a corridor that ends where it began, two identical offices on a corridor, ten rooms in a
-    circuit, an L-shaped flat, two rooms with slanted walls, two storeys joined by stairs, a furnished flat drawn by its number, the
-    same with mirrors and glass, a floor of eight furnished rooms on a corridor."""
+    circuit, an L-shaped flat, two rooms with slanted walls, two storeys joined by stairs, a furnished flat drawn by its number, the same with
+    mirrors and glass, a floor of eight furnished rooms on a corridor with a stair to two more, two identical storeys."""
 
     room = "room"
     corridor = "corridor"
@@ -45,6 +46,7 @@ class Scene(Enum):
     random_flat = "random_flat"
     glazed_flat = "glazed_flat"
     whole_floor = "whole_floor"
+    storeys = "storeys"
 
 
 class Sensor(Enum):
@@ -56,7 +58,7 @@ class Sensor(Enum):
 
 BUILDINGS: dict[Scene, Callable[[], Building]] = {Scene.corridor: buildings.corridor, Scene.offices: buildings.offices, Scene.rooms: buildings.rooms,
              Scene.flat: buildings.flat, Scene.slanted_flat: buildings.slanted_flat, Scene.house: buildings.house,
-             Scene.whole_floor: whole_floor}  # fmt: skip
+             Scene.whole_floor: whole_floor, Scene.storeys: buildings.storeys}  # fmt: skip
 FLATS: dict[Scene, Callable[[int], Building]] = {Scene.random_flat: random_flat, Scene.glazed_flat: glazed_flat}
 SENSORS = {Sensor.kinect: KINECT, Sensor.stereo: STEREO}
 ROOM_FRAMES = 150  # of the room, whose walk never ends
@@ -69,7 +71,7 @@ class Synthetic:
     """A furnished room of 5 × 4 × 2.7 m, or a building, ray traced when a frame is asked for. Frame i depends on the fields and i alone."""
 
     frames: Frames = ""  # part to make, half open: A:B, A:, :B, every S-th A:B:S; empty = all
-    scene: Scene = Scene.room  # room | corridor | offices | rooms | flat | slanted_flat | house | random_flat | glazed_flat | whole_floor
+    scene: Scene = Scene.room  # room | corridor | offices | rooms | flat | slanted_flat | house | random_flat | glazed_flat | whole_floor | storeys
     length: NonNegativeInt = 0  # frames; 0 = the scene's own: 150 of the room, once round a building (a longer walk goes on)
     fps: PositiveFloat = 30.0
     seed: NonNegativeInt = 0  # of textures, path and noise

@@ -18,6 +18,7 @@ from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat, Posit
 from trihedron.pipeline.core.types import F64, I32, Correction, Frame, Map, Matches
 from trihedron.plugins.loop.initial_alignment import initial_pose
 from trihedron.plugins.loop.manhattan_prior import align_with_manhattan, correct_loop, estimate_manhattan_prior
+from trihedron.plugins.loop.storeys import on_storey_of_last
 from trihedron.plugins.mapping.covisibility_graph import LocalWindow, current_submap, keyframes_of, observed_by
 from trihedron.plugins.mapping.data_association import PredictedPose, SearchOptions, search_map
 from trihedron.plugins.mapping.keyframe_features import features_of
@@ -119,7 +120,7 @@ def accept_loop(options: LoopOptions, found: PoseSolution, matches: Matches, exp
     return bool(plausible and enough and not found.unobservable.shape[1])
 
 
-# Candidates: earlier keyframes within reach of the drift since.
+# Candidates: earlier keyframes on the same storey, within reach of the drift since.
 
 
 @dataclass(frozen=True)
@@ -141,13 +142,14 @@ def path_lengths(map: Map) -> tuple[I32, F64]:
 
 
 def within_reach(options: LoopOptions, map: Map, most: int) -> tuple[I32, F64]:
-    """Return up to `most` keyframes that the newest one may have come back to, nearest first, and the length of the path since."""
+    """Return up to `most` keyframes of its storey that the newest one may have come back to, nearest first, and the length of the path since."""
     rows, path_m = path_lengths(map)
     poses = map.keyframes.rows("T_world_camera", rows)
     distance = np.linalg.norm(poses[:, :3, 3] - poses[-1, :3, 3], axis=1)
     cosine = matmul(poses[:, :3, 2], poses[-1, :3, 2])
     reach = options.view_m + 3.0 * drift_sigma_m(options, path_m)
-    chosen = np.flatnonzero((path_m > options.away_m) & (distance < reach) & (cosine > np.cos(np.radians(options.view_deg))))
+    near = (path_m > options.away_m) & (distance < reach) & (cosine > np.cos(np.radians(options.view_deg)))
+    chosen = np.flatnonzero(near & on_storey_of_last(map, rows, options.drift_share) if near.any() else near)
     chosen = chosen[np.argsort(distance[chosen] / options.view_m + 1.0 - cosine[chosen], kind="stable")][:most]
     return rows[chosen], path_m[chosen]
 

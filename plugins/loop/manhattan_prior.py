@@ -58,7 +58,7 @@ def estimate_manhattan_prior(map: Map) -> ManhattanPrior | None:
     planes, at_plane = _middle_observers(map.planes, rows)
     lines, at_line = _middle_observers(map.lines, rows)
     coefficients, covariance = map.planes.rows("coefficients", planes), map.planes.rows("covariance", planes)
-    R = _axes(coefficients, covariance, map.planes.rows("found", planes))
+    R = estimate_axes(coefficients, covariance, map.planes.rows("found", planes))
     if R is None:
         return None
     ends, end_covariance = map.lines.rows("endpoints_m", lines), inv_symmetric(map.lines.rows("information", lines))
@@ -81,7 +81,7 @@ def _middle_observers(landmarks: Table, keyframes: I32) -> tuple[I32, I32]:
     return ids[known], place[known].astype(np.int32)
 
 
-def _axes(planes: F64, covariance: F64, views: I32) -> F64 | None:
+def estimate_axes(planes: F64, covariance: F64, views: I32) -> F64 | None:
     """R_world_manhattan on most views of the walls (n, 4), or None."""
     most = np.argsort(-views, kind="stable")[:WALLS]
     walls: Walls = known_walls(planes[most], covariance[most], views[most], WALL_SIGMA)

@@ -76,17 +76,23 @@ def test_a_flat_of_a_number_is_whole_and_its_walk_is_clear(number: int) -> None:
     assert again.walk == building.walk and len(again.room.solids) == len(building.room.solids)
 
 
-def test_a_whole_floor_has_eight_rooms_on_a_corridor() -> None:
-    (plan,) = Synthetic(scene=Scene.whole_floor).plans()
+def test_a_whole_floor_has_eight_rooms_on_a_corridor_and_two_upstairs() -> None:
+    """A stairwell at the end of the corridor leads to a landing; the walk shows every room, and every storey for itself."""
+    ground, upper = Synthetic(scene=Scene.whole_floor).plans()
     building = whole_floor()
-    assert (len(plan.rooms), len(plan.doorways)) == (9, 8)
+    assert [(len(plan.rooms), len(plan.doorways)) for plan in (ground, upper)] == [(10, 9), (3, 3)]
+    assert (ground.floor_m, ground.ceiling_m, upper.floor_m, upper.ceiling_m) == pytest.approx((0.0, 2.7, 3.0, 5.7))
     places = np.array([building.walk.pose(0, t)[:3, 3] for t in np.linspace(0.0, building.walk.duration_s, 1000)])
-    assert building.walk.length_m == pytest.approx(179.8, abs=0.1) and clearance_m(building, places) > 0.1
-    assert all(shapely.contains_xy(shapely.Polygon(room[0], room[1:]), *places[:, :2].T).any() for room in plan.rooms)
+    assert building.walk.length_m == pytest.approx(261.8, abs=0.1) and clearance_m(building, places) > 0.1
+    for plan in (ground, upper):
+        there = places[np.abs(places[:, 2] - plan.floor_m - 1.45) < 0.2, :2]
+        assert all(shapely.contains_xy(shapely.Polygon(room[0], room[1:]), *there.T).any() for room in plan.rooms)
+    again = whole_floor()
+    assert again.walk == building.walk and [s.centre.tolist() for s in again.room.solids] == [s.centre.tolist() for s in building.room.solids]
 
 
-def test_a_number_is_for_random_flats_alone() -> None:
-    with pytest.raises(ValueError, match="flat: only scene=random_flat has a number"):
+def test_a_number_is_for_flats_that_are_drawn_alone() -> None:
+    with pytest.raises(ValueError, match="flat: only scene=random_flat and scene=glazed_flat have a number"):
         Synthetic(flat=3)
 
 
@@ -115,13 +121,17 @@ def test_frames_have_depth_and_none_beyond_the_sensor(scene: tuple[Scene, Buildi
     np.testing.assert_array_equal(truth.poses[number], scene[1].walk.pose(0, number / 30))
 
 
-def test_the_offices_cannot_be_told_apart() -> None:
+@pytest.mark.parametrize(
+    ("name", "place", "shift"), [(Scene.offices, (3.4, 2.8, 1.4), (6.8, 0.0, 0.0)), (Scene.storeys, (2.9, 4.2, 1.4), (0.0, 0.0, 3.0))]
+)
+def test_offices_and_storeys_cannot_be_told_apart(name: Scene, place: tuple[float, ...], shift: tuple[float, ...]) -> None:
     """The same view in both, but for the rounding of a few samples on edges."""
-    room = BUILDINGS[Scene.offices]().room
+    room = BUILDINGS[name]().room
     geometry, atlas = geometry_of(room), bake(all_faces(room), True, 0, 0.1)
-    pose = np.array([[1.0, 0.0, 0.0, 3.4], [0.0, 0.0, 1.0, 2.8], [0.0, -1.0, 0.0, 1.4], [0.0, 0.0, 0.0, 1.0]])  # north, from the door
+    pose = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])  # north
+    pose[:3, 3] = place
     other = pose.copy()
-    other[0, 3] += 6.8
+    other[:3, 3] += shift
     (color, depth, _, _), (color2, depth2, _, _) = (render(geometry, atlas, CAMERA, T) for T in (pose, other))
     difference = np.abs(color.astype(int) - color2)
     assert (difference <= 1).mean() > 0.995 and difference.mean() < 0.05 and np.ptp(color) > 100

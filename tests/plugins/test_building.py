@@ -255,10 +255,11 @@ def test_each_file_is_written_alone(offices, tmp_path):
         pytest.param("slanted_flat", "atlanta_layout", marks=pytest.mark.slow),
         pytest.param("slanted_flat", "cells", marks=pytest.mark.slow),
         pytest.param("house", "manhattan_layout", marks=pytest.mark.slow),
+        pytest.param("whole_floor", "manhattan_layout", marks=pytest.mark.slow),
     ],
 )
 def test_wardrobes_slanted_walls_and_storeys(scene, name):
-    """The flat has an L-shaped room, a wardrobe that is no wall, a door ajar and a window; the house two storeys."""
+    """The flat has an L-shaped room, a wardrobe that is no wall, a door ajar and a window; the house and the whole floor two storeys."""
     dataset = Synthetic(scene=Scene[scene], fps=2.0, width=160, height=120, texture=False, noise=False)
     truth = dataset.truth()
     frames = [dataset(k) for k in range(len(dataset))]

@@ -13,6 +13,7 @@ from trihedron.pipeline.core.types import Frame, Matches, Pose
 from trihedron.plugins.loop.appearance import AppearanceLoop
 from trihedron.plugins.loop.loop_closing import accept_loop, path_lengths, place_of
 from trihedron.plugins.loop.planes import PlanesLoop
+from trihedron.plugins.loop.storeys import climbs_m, on_storey_of_last
 from trihedron.plugins.map.covisibility import Covisibility
 from trihedron.plugins.mapping.correction import apply_correction
 from trihedron.plugins.mapping.covisibility_graph import observed_by
@@ -23,10 +24,11 @@ from trihedron.plugins.shared.pose_optimizer import solve_pose
 from trihedron.plugins.shared.residuals_kernels import PlaneTerms
 
 sys.path.insert(0, str(Path(__file__).parent))
-from landmark_world import CAMERA, World, rotation_of, translation_of
+from landmark_world import CAMERA, INTO_CORNER, World, rotation_of, translation_of
 
 STEPS = 40  # frames of the walk: 2.4 m out and back, ending where it began
 DRIFT_M = np.array([0.25, -0.02, 0.15])  # at its end
+UP, CLIMB_M = -INTO_CORNER[:3, 1], 3.0
 OPTIONS = {"every": 1, "away_m": 2.0, "view_m": 0.5, "drift_share": 0.1}
 LOOPS = {"planes": PlanesLoop(**OPTIONS), "appearance": AppearanceLoop(**OPTIONS)}
 
@@ -50,18 +52,36 @@ def frame_at(world, index, depth_m=None):
     return Frame(index, index * 33_000_000, np.zeros((*depth.shape, 3), np.uint8), depth, CAMERA)
 
 
-@pytest.fixture(scope="module")
-def walked():
-    """The world and the map of a walk whose poses drift; every frame is a keyframe."""
+def upstairs_pose(index):
+    """From the middle of the walk on, a storey higher: upstairs looks the same to the last detail."""
+    T = true_pose(index).copy()
+    T[:3, 3] += CLIMB_M * UP * (index >= STEPS // 2)
+    return T
+
+
+def map_of_walk(pose_at):
+    """The world and the map of a walk, tracked at the poses that `pose_at` returns; every frame is a keyframe."""
     world, map = World(points=2000), None
     stage = Covisibility(min_frames=1, max_frames=1, min_shift=1e-3)
     for index in range(STEPS):
-        truth, T = true_pose(index), drifted_pose(index)
+        truth, T = true_pose(index), pose_at(index)
         features = world.features(truth, index)
         matches = LocalMap(near=0)(world.frame(index).camera, rotation_of(T, index), translation_of(T, index), *features, map, None)
         pose = Pose(index, index * 33_000_000, T, np.eye(6) * 1e-6, T, -1, np.zeros(3, np.int32), 0, "ok", "")
         map = stage(world.frame(index), pose, *features, matches, map, None, None, None) or map
     return world, map
+
+
+@pytest.fixture(scope="module")
+def walked():
+    """The world and the map of a walk whose poses drift."""
+    return map_of_walk(drifted_pose)
+
+
+@pytest.fixture(scope="module")
+def climbed():
+    """The world and the map of a walk that goes on upstairs."""
+    return map_of_walk(upstairs_pose)
 
 
 @pytest.mark.parametrize("name", LOOPS)
@@ -89,6 +109,26 @@ def test_a_drift_that_cannot_be_is_refused(walked, name):
     """The same view, but 0.3 m away after 3 m with a drift of 1 %: another place that looks the same."""
     world, map = walked
     assert dataclasses.replace(LOOPS[name], drift_share=0.01)(map, frame_at(world, STEPS - 1)) is None
+
+
+@pytest.mark.parametrize("name", LOOPS)
+def test_another_storey_that_looks_the_same_is_refused(climbed, name, monkeypatch):
+    """The drift may be as large as a storey is high, and all that is in view agrees."""
+    world, map = climbed
+    closer, frame = dataclasses.replace(LOOPS[name], drift_share=0.2, straighten=0), frame_at(world, STEPS - 1)
+    assert closer(map, frame) is None
+    monkeypatch.setattr("trihedron.plugins.loop.loop_closing.on_storey_of_last", lambda map, rows, share: np.ones(len(rows), np.bool_))
+    correction = closer(map, frame)
+    shift = correction.T_world_keyframe[-1, :3, 3] - map.keyframes.column("T_world_camera")[-1, :3, 3]
+    np.testing.assert_allclose(shift, -CLIMB_M * UP, atol=0.1)
+
+
+def test_stairs_are_a_climb_and_drift_is_none(climbed, walked):
+    rows = np.arange(STEPS, dtype=np.int32)
+    climb = climbs_m(climbed[1], rows, 0.01)
+    np.testing.assert_allclose(climb, np.where(rows < STEPS // 2, 0.0, CLIMB_M), atol=0.1)
+    np.testing.assert_array_equal(on_storey_of_last(climbed[1], rows, 0.01), rows >= STEPS // 2)
+    assert on_storey_of_last(walked[1], rows, 0.01).all()
 
 
 @pytest.mark.parametrize("name", LOOPS)
