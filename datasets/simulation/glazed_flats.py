@@ -15,7 +15,8 @@ WARDROBE_M, WINDOW_WIDE_M, PORTRAIT_WIDE_M = 1.7, 1.2, 0.6  # by which fronts of
 
 
 def glazed_flat(number: int) -> Building:
-    """Make flat `number` with mirrors on doors of wardrobes, in frames of pictures and from the floor up, glass in its windows, and windows between rooms."""
+    """Make flat `number` with mirrors on doors of wardrobes, in frames of pictures and from the floor up, and glass in its windows and between
+    rooms."""
     flat, rng = random_flat(number), np.random.default_rng([number, 47])
     solids, panes = list[Solid](), list[Pane]()
     for solid in flat.room.solids:
@@ -60,7 +61,7 @@ def _window_in(rng: np.random.Generator, wall: Solid, others: tuple[Solid, ...])
     """Return a partition with a window of 1 m by 1.1 m in its middle instead, and its pane, where nothing stands or hangs there; else None."""
     long = int(np.argmax(wall.half[:2]))
     length, thick = 2.0 * float(wall.half[long]), 2.0 * float(wall.half[1 - long])
-    partition = all(face.material == "wall" for face in wall.faces) and 1.6 < length and thick < 0.2 and wall.half[2] * 2.0 > HEIGHT_M - 1e-6
+    partition = all(face.material == "wall" for face in wall.faces) and length > 1.6 and thick < 0.2 and wall.half[2] * 2.0 > HEIGHT_M - 1e-6
     if not partition or rng.uniform() < 0.3:
         return None
     along, across = wall.R_world_solid[:, long], wall.R_world_solid[:, 1 - long]

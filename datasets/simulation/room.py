@@ -57,7 +57,7 @@ class Solid:
 
 
 class Glass(Enum):
-    """What a pane does: reflects, is seen through, is seen through but swallows the projector's light."""
+    """Kind of pane: one that reflects, one that is seen through, one that is seen through but swallows the light of the projector."""
 
     mirror = 0
     inner = 1

@@ -39,7 +39,8 @@ class Mirror:
     heights: tuple[float, float]
 
     def crossing(self, eye: F64, points: F64) -> tuple[F64, Bool]:
-        """Return the shares (n,) of the ways from eyes (3,) or (n, 3) to points (n, 3) that are before the mirror, and which rays (n,) it turns back."""
+        """Return the shares (n,) of the ways from eyes (3,) or (n, 3) to points (n, 3) that are before the mirror, and which rays (n,) it turns
+        back."""
         before = matmul(eye[..., :2], self.normal) - self.offset_m
         behind = self.offset_m - matmul(points[:, :2], self.normal)
         share = np.where((before > 0.0) & (behind > 0.0), before / np.maximum(before + behind, 1e-9), 1.0)
@@ -146,7 +147,7 @@ def _crossing(readings: UprightReadings, face: Face, span: tuple[float, float]) 
     turned[:, :2] -= 2.0 * facing[:, None] * normal
     repeats = _is_read(reflected, turned, readings, (off > 0.0) & (away > 0.0)) & ~_is_read(through, normals[rays], readings, away < 0.0)
     column = np.floor((matmul(through[:, :2], face.along) - face.start_m) / CELL_M).astype(int)
-    reached = np.convolve(np.pad(face.count.any(axis=1), REACH), np.ones(2 * REACH + 1), "same") > 0.0
+    reached = sliding_sum(np.pad(face.count.any(axis=1), REACH).astype(np.float64), np.ones(2 * REACH + 1)) > 0.0
     met = reached[np.clip(column + REACH, 0, len(reached) - 1)]
     return Crossing(along, height, np.where(np.abs(facing) > FACING, 1.0, np.where(met, ASIDE_WEIGHT, 0.0)), repeats)
 

@@ -1,0 +1,86 @@
+"""Mirrors in plans of buildings: on true poses, what a mirror shows is no room and no opening, and glass between rooms is a window."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from trihedron.comparison.building_errors import plan_errors
+from trihedron.datasets.simulation.glazed_flats import glazed_flat
+from trihedron.datasets.simulation.room import Glass
+from trihedron.datasets.simulation.synthetic import Scene, Synthetic
+from trihedron.pipeline.core.types import OPENING_KINDS, Building, Camera
+from trihedron.plugins.building import layout, openings
+from trihedron.plugins.building.evidence import Evidence
+from trihedron.plugins.building.mirrors import Mirror, without_mirrors
+from trihedron.plugins.shared.keyframe_views import KeyframeView
+
+sys.path.insert(0, str(Path(__file__).parent))
+from test_building import folded, planes_of, pose_at
+
+FLAT = 3  # a window between rooms, and mirrors on wardrobes, in frames and from the floor up
+
+
+@pytest.fixture(scope="module")
+def walk() -> tuple[Synthetic, list]:
+    dataset = Synthetic(scene=Scene.glazed_flat, flat=FLAT, seed=FLAT, fps=2.5, width=160, height=120, texture=False)
+    truth = dataset.truth()
+    frames = [dataset(k) for k in range(len(dataset))]
+    return dataset, [(frame, planes_of(frame), pose_at(k, truth.poses[k])) for k, frame in enumerate(frames)]
+
+
+def false_openings(plan: Building, dataset: Synthetic) -> int:
+    """Count openings further than 0.3 m from each true one."""
+    (truth,) = dataset.plans()
+    true = [gap.middle for gap in (*truth.doorways, *truth.windows)]
+    middles = []
+    for wall, span in zip(plan.opening_walls, plan.spans_m):
+        start, end = plan.walls_m[wall] @ plan.T_world_building[:2, :2].T + plan.T_world_building[:2, 3]
+        middles.append(start + (end - start) / np.linalg.norm(end - start) * span.mean())
+    return sum(all(np.linalg.norm(middle - other) > 0.3 for other in true) for middle in middles)
+
+
+def test_what_mirrors_show_is_neither_a_room_nor_an_opening(walk, monkeypatch: pytest.MonkeyPatch) -> None:
+    dataset, inputs = walk
+    plan = folded("manhattan_layout", inputs)
+    figures = plan_errors(plan, np.eye(4), dataset.plans())
+    assert figures["room_recall"] == figures["room_precision"] == figures["door_recall"] == figures["door_precision"] == 1.0
+    assert false_openings(plan, dataset) == 0
+    monkeypatch.setattr(layout, "mirrors_of", lambda *inputs: [])
+    monkeypatch.setattr(openings, "_is_mirror", lambda *inputs: False)
+    assert false_openings(folded("manhattan_layout", inputs), dataset) >= 1
+
+
+def test_glass_between_rooms_is_a_window(walk) -> None:
+    dataset, inputs = walk
+    (window,) = dataset.plans()[0].windows
+    assert sum(pane.kind is Glass.inner for pane in glazed_flat(FLAT).room.panes) == 1
+    plan = folded("manhattan_layout", inputs)
+    (found,) = [k for k, kind in enumerate(plan.opening_kinds) if OPENING_KINDS[kind] == "window"]
+    assert plan.opening_heights_m[found] == pytest.approx([window.bottom_m, window.height_m], abs=0.15)
+    assert 0.5 < np.ptp(plan.spans_m[found]) < window.width_m + 0.05 and min(plan.opening_rooms[found]) >= 0  # its ends are seen at a slant
+
+
+def test_a_ray_ends_at_the_mirror_that_turns_it_back() -> None:
+    mirror = Mirror(np.array([0.0, 1.0]), 0.0, (-0.5, 0.5), (0.5, 1.5))  # faces north; along it is east
+    eye, points = np.array([0.0, 2.0, 1.0]), np.array([[0.2, -2.0, 1.0], [3.0, -2.0, 1.0], [0.0, 1.0, 1.0], [0.0, -2.0, 3.0]])
+    share, turned = mirror.crossing(eye, points)
+    assert turned.tolist() == [True, False, False, False]  # beside it, before it, above it
+    assert share[0] == pytest.approx(0.5)
+    T = np.eye(4)
+    T[:3, :3] = [[-1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, -1.0, 0.0]]  # looks south
+    T[:3, 3] = eye
+    camera = Camera(3, 3, 1.0, 1.0, 1.0, 1.0)  # 45° between its rays
+    view = KeyframeView(0, camera, np.full((3, 3), 4.0, np.float32), np.zeros((0, 0, 3), np.uint8), np.zeros((3, 3), np.uint8), np.zeros((0, 4)),
+                        T, np.eye(4), -1, -1, 0)  # fmt: skip
+    normals = np.tile([0.0, -1.0, 0.0], (4, 1))
+    evidence = Evidence(np.eye(4), [view], [T], np.zeros((1, 3, 3)), points, normals, np.ones(4), np.ones(4), np.zeros(4, np.int32))
+    moved = without_mirrors(evidence, [mirror])
+    assert moved.points[0] == pytest.approx([0.1, 0.0, 1.0]) and moved.normals[0] == pytest.approx([0.0, 1.0, 0.0])
+    assert np.array_equal(moved.points[1:], points[1:]) and np.array_equal(moved.normals[1:], normals[1:])
+    depth = np.full((3, 3), 4.0)
+    depth[1, 1] = 2.0
+    assert moved.views[0].depth_m == pytest.approx(depth) and evidence.views[0].depth_m.min() == 4.0
