@@ -20,6 +20,7 @@ UNSEEN = 0.25  # of the area of a cell that no ray passed, which counts against 
 WIDE_M2 = 2.0  # cell, of which all of it does: nobody overlooks so much of a room
 THIN_M = 0.38  # width of a cell that may be within a wall
 CAPACITY = 10_000  # of a square metre: capacities are whole numbers
+SLIVER_M = 0.005  # between lines that are one
 ON_LINE_M, LEAST_COSINE = 0.02, 0.9998  # of a stretch on the line of a face
 TALL_SHARE = 0.5  # of an edge between cells, for which it parts them
 
@@ -45,7 +46,9 @@ def cells_of(faces: list[Face], space: FreeSpace) -> Cells:
     reach = float(norm(high - low))
     middle = (low + high) / 2.0
     lines = [box.exterior]
-    for face in faces:
+    for number, face in enumerate(faces):
+        if any(_is_one_line(face, other) for other in faces[:number]):
+            continue
         foot = middle + (face.offset_m - matmul(middle, face.normal)) * face.normal
         lines.append(shapely.LineString([foot - reach * face.along, foot + reach * face.along]).intersection(box))
     polygons = list(polygonize(unary_union(shapely.set_precision(lines, 1e-5))))
@@ -63,6 +66,12 @@ def cells_of(faces: list[Face], space: FreeSpace) -> Cells:
             a, b = np.array(p), np.array(q)
             edges.append((pair[0], pair[1], _tall_share(parting, a, b), float(norm(b - a))))
     return Cells(polygons, free, edges)
+
+
+def _is_one_line(face: Face, other: Face) -> bool:
+    """Say if the lines of two faces, whichever way they look, are one but for a sliver."""
+    side = float(matmul(face.normal, other.normal))
+    return abs(side) > 1.0 - 1e-6 and abs(face.offset_m - np.sign(side) * other.offset_m) < SLIVER_M
 
 
 def _free_share(polygon: Any, space: FreeSpace) -> float:

@@ -15,7 +15,7 @@ from trihedron.plugins.building.free_space_kernels import LEVELS
 from trihedron.plugins.shared.voxel_hash_kernels import I64
 
 DEPTH_M = (0.1, 1.0)  # of a jog
-BESIDE_M = 0.4  # from the end of the face in front, where the face behind is read
+BESIDE_M, HIDDEN_M = 0.25, 1.0  # stretch in which the face behind is read, and how far from the end of the face in front it may begin
 SHORT_M = 0.2  # least wall that meets the ceiling: the side of a niche, a column
 MOSTLY_BEHIND = 0.3  # of the levels at which the face behind is read, fewer than which the front is read beyond its end
 END_M = 0.25  # of a face, whose readings say where it ends
@@ -52,13 +52,16 @@ def parting_columns(face: Face, faces: list[Face]) -> Bool:
 
 
 def _is_read_beyond(front: Face, other: Face, column: int, at_end: bool) -> bool:
-    """Say if beyond an end of a stretch the front is not read, and the other face is, as far behind it as a jog is deep."""
+    """Say if beyond an end of a stretch the front is not read, and the other face is, as far behind it as a jog is deep; next to the end it may be
+    hidden."""
     if float(matmul(front.normal, other.normal)) < 0.999 or not DEPTH_M[0] < front.offset_m - other.offset_m < DEPTH_M[1]:
         return False
-    end, width = front.start_m + CELL_M * column, round(BESIDE_M / CELL_M)
-    beyond = end + CELL_M * (np.arange(width) + 1.5) * (1.0 if at_end else -1.0)
+    end, width, hidden = front.start_m + CELL_M * column, round(BESIDE_M / CELL_M), round(HIDDEN_M / CELL_M)
+    beyond = end + CELL_M * (np.arange(hidden + width) + 1.5) * (1.0 if at_end else -1.0)
     ahead, behind = (levels_read(face, np.asarray(beyond, np.float64)) for face in (front, other))
-    return bool(ahead.sum() < MOSTLY_BEHIND * behind.sum() and (behind > 0).mean() > 0.5)
+    first = int(np.argmax(behind > 0))
+    there = behind[first : first + width]
+    return bool(first < hidden and ahead[: first + width].sum() < MOSTLY_BEHIND * there.sum() and (there > 0).mean() > 0.5)
 
 
 def is_recess(wall: Face, begin_m: float, end_m: float, faces: list[Face]) -> bool:

@@ -23,8 +23,9 @@ LEAST_LOOKS = 2
 LEAST_LEVELS = 4  # at which views look through below what is read: under a lintel, a beam, the edge of a slab
 LEAST_SHARE = 0.15  # of a stretch's columns, by which its height is judged, and from which it was looked over
 LONG_M = 0.4  # shorter stretches are judged by half of their columns
-PRIORS = {"backed": 0.95, "behind": 0.25, "alone": 0.75}  # probabilities of a wall before its height is known: `_prior`
+PRIORS = {"backed": 0.95, "behind": 0.25, "narrow": 0.6, "alone": 0.75}  # probabilities of a wall before its height is known: `_prior`
 MISTAKEN = 0.02  # how often a view is thought to look over a wall
+COLUMN_M = (0.3, 0.45)  # widths of columns; furniture as high as a man is seldom as narrow
 KNOWN = 0.8  # probability, without what is behind, from which a stretch is a wall by which others are judged
 DEEPEST_M, USUAL_DEPTH_M = 1.0, 0.6  # of furniture
 THIN_M = 0.2  # what is nearer to a wall that is seen on both its sides, a curtain or a pilaster, is no wall
@@ -60,14 +61,15 @@ def remove_furniture(
     faces: list[Face], evidence: Evidence, storey: Storey, space: FreeSpace, least_m: float
 ) -> tuple[list[Face], list[Doubt]]:  # fmt: skip
     """Return the faces without the stretches that are rather furniture than walls, and how certain that is of each stretch. What stands behind those
-    removed is marked in `space`; a face of which less than `least_m` is left is none unless it reaches higher than furniture."""
+    removed is marked in `space`; a face of which less than `least_m` is left is none unless it reaches higher than
+    furniture or is as wide as a column."""
     highest = min(FURNITURE_M[1], storey.ceiling_m - storey.bottom_m - BELOW_CEILING_M) if np.isfinite(storey.ceiling_m) else FURNITURE_M[1]
     inverses = [inv(T) for T in evidence.poses]
     stretches = [_stretches(face, evidence, storey, inverses) for face in faces]
     faces = [_with_known(face, found, highest, faces) for face, found in zip(faces, stretches)]
     kept, doubts = [], []
     for face, found in zip(faces, stretches):
-        tall, high = face.tall.copy(), False
+        tall, counts = face.tall.copy(), False
         for one in found:
             depth = _depth_to_wall(face, one, faces)
             probability = wall_probability(one, highest, _prior(face, one, faces, depth))
@@ -77,10 +79,11 @@ def remove_furniture(
             if probability < 0.5:
                 tall[one.begin : one.end] = False
                 space.furnish(_footprint(face, one, deep))
-            high |= probability >= KNOWN and one.height_m >= highest and (one.end - one.begin) * CELL_M >= SHORT_M - 1e-9
+            wide_m = (one.end - one.begin) * CELL_M + 1e-9
+            counts |= (probability >= KNOWN and one.height_m >= highest and wide_m >= SHORT_M) or (probability >= 0.5 and wide_m >= COLUMN_M[0])
             ends = (face.start_m + CELL_M * np.array([[one.begin], [one.end]])) * face.along + face.offset_m * face.normal
             doubts.append(Doubt(ends, face.normal, deep, probability))
-        if high or longest_run(tall) * CELL_M >= least_m:
+        if counts or longest_run(tall) * CELL_M >= least_m:
             kept.append(replace(face, tall=tall))
     return kept, [doubt for doubt in doubts if 0.0 < doubt.wall_probability < 1.0]
 
@@ -115,7 +118,9 @@ def _prior(face: Face, one: Stretch, faces: list[Face], depth: float | None) -> 
     """Return the probability of a wall where its other face is close behind or it continues one, where a wall is seen behind, and elsewhere."""
     if _is_backed(face, one, faces) or _continues(face, one):
         return PRIORS["backed"]
-    return PRIORS["alone" if depth is None else "behind"]
+    if depth is None:
+        return PRIORS["alone"]
+    return PRIORS["narrow" if COLUMN_M[0] - 1e-9 <= (one.end - one.begin) * CELL_M <= COLUMN_M[1] + 1e-9 else "behind"]
 
 
 def _with_known(face: Face, found: list[Stretch], highest: float, faces: list[Face]) -> Face:

@@ -19,13 +19,16 @@ from trihedron.pipeline.core.plan_areas import area_interval, area_sigma, seen_s
 from trihedron.pipeline.core.registry import drawing_of, load_plugins, plugin_class
 from trihedron.pipeline.core.types import OPENING_KINDS, Building, Camera, Frame, Planes, Pose
 from trihedron.pipeline.record.foxglove import TopicView
-from trihedron.plugins.building.cell_complex import Cells, inside_cells
+from trihedron.plugins.building.cell_complex import Cells, cells_of, components, inside_cells
 from trihedron.plugins.building.edges import Edge, end_at_readings, intersect_edges, make_relative, rotate_edge
+from trihedron.plugins.building.evidence import Evidence
 from trihedron.plugins.building.faces import Face
 from trihedron.plugins.building.files import building_json, summary, write_building
+from trihedron.plugins.building.free_space import FreeSpace
 from trihedron.plugins.building.free_space_kernels import LEVELS
 from trihedron.plugins.building.geometry import wall_pieces
 from trihedron.plugins.building.ifc import has_ifc, write_ifc
+from trihedron.plugins.building.jogs import jog_sides
 from trihedron.plugins.building.openings import fit_jambs, widest_gap
 from trihedron.plugins.building.svg import floorplan_svg
 from trihedron.plugins.building.tall_furniture import Stretch, wall_probability
@@ -440,6 +443,38 @@ def test_a_wall_ends_with_its_readings_where_nothing_bounds_the_room():
     behind = Face(np.array([1.0, 0.0]), 1.1, -1.5, np.ones((40, LEVELS), np.int32), np.ones(40, np.bool_), np.empty(0, np.int64))
     ring[0] = Edge(normals[0], 0.0, face, corners[0], corners[1])
     assert len(end_at_readings(ring, [face, behind])) == 4  # the wall there was seen from behind
+
+
+def column_and_wall(hidden: int) -> tuple[Face, Face]:
+    """The front of a column of 0.35 m before a wall, of which that many cells beside the column's end were not read."""
+    none = np.empty(0, np.int64)
+    front = Face(np.array([0.0, 1.0]), 0.35, 0.0, np.ones((7, LEVELS), np.int32), np.ones(7, np.bool_), none)
+    count = np.ones((120, LEVELS), np.int32)
+    count[40 : 47 + hidden] = 0
+    return front, Face(np.array([0.0, 1.0]), 0.0, -2.0, count, count.any(axis=1), none)
+
+
+@pytest.mark.parametrize(("hidden", "sides"), [(0, [1, -1]), (12, [1, -1]), (30, [-1])])
+def test_the_side_of_a_column_may_hide_some_of_the_wall_beside_it(hidden, sides):
+    """The side is where the readings of the front end, if the wall behind is read at most a metre on."""
+    nothing = Evidence(np.eye(4), [], [], np.empty((0, 3, 3)), np.empty((0, 3)), np.empty((0, 3)), np.empty(0), np.empty(0), np.empty(0, np.int32))
+    found = jog_sides(list(column_and_wall(hidden)), nothing)
+    assert sorted((int(side.normal[0]), round(side.offset_m, 6)) for side in found) == sorted((sign, 0.35 if sign > 0 else 0.0) for sign in sides)
+    for side in found:  # from the front to the wall
+        ends = side.start_m, side.start_m + 0.05 * len(side.count)
+        assert sorted(abs(end) for end in ends) == pytest.approx([0.0, 0.35], abs=0.03)
+
+
+def test_lines_that_are_nearly_one_part_no_room():
+    """The two faces of a corner, fitted 2 mm apart."""
+    none, normal = np.empty(0, np.int64), np.array([0.0, 1.0])
+    faces = [
+        Face(sign * normal, sign * offset, -0.5, np.ones((5, LEVELS), np.int32), np.ones(5, np.bool_), none)
+        for sign, offset in ((1.0, 1.0), (-1.0, 1.00005))
+    ]
+    space = FreeSpace(np.zeros(2), np.full((40, 40), 7, np.uint32), np.ones((40, 40), np.bool_), np.zeros((40, 40), np.bool_))
+    cells = cells_of(faces, space)
+    assert len(cells.polygons) == 2 and len(components(cells, inside_cells(cells))) == 1
 
 
 @pytest.mark.parametrize("turn_deg", [-2.0, 1.0])
