@@ -11,6 +11,7 @@ ALLOWED = {  # pattern of a skip's reason -> why the development environment doe
     r"could not import 'rclpy'": "ROS 2 is on no package index",
     r"is not beside this checkout": "the published sequences are gigabytes",
     r"needs the packages that examples/export_networks.py names": "PyTorch has an environment of its own",
+    r"needs the packages that examples/look_at_ifc.py names": "VTK has an environment of its own",
     r"needs SLURM": "its daemons are a cluster's",
     r"another C library": "only glibc has the heaps",
     r"the kernels of x86-64": "another architecture",

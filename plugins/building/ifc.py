@@ -18,11 +18,12 @@ from trihedron.pipeline.core.libraries import imports_of
 from trihedron.pipeline.core.linalg import norm
 from trihedron.pipeline.core.plan_areas import area_interval, area_sigma, seen_share
 from trihedron.pipeline.core.types import ELEMENTS, F64, SUPPORTS, Building
-from trihedron.plugins.building.geometry import SHEET_M, rings_of, rooms_on, storey_levels
+from trihedron.plugins.building.geometry import SHEET_M, floor_plate, joined_spans, rings_of, rings_of_parts, rooms_on, storey_levels
 from trihedron.plugins.building.labels import label_of, use_of
 
 IFC = "model.ifc"
 SLAB_M = 0.2  # thickness of a slab, but between two storeys, where it was measured
+SLIVER_M = 0.2  # width below which what one storey leaves uncovered of another is an error of their walls
 MARGIN_M = 0.01  # by which a void is thicker than its wall
 PROPERTIES = "Trihedron_Measurement"
 NAMESPACE = uuid.UUID("8d1c0a3e-6f2b-5f7e-9a4d-2b1f6c7e9d10")  # of the GlobalIds: the same building gives the same
@@ -75,7 +76,8 @@ class _IfcWriter:
         self._aggregate(site, self.project)
         self._aggregate(house, site)
         storeys = [self._storey(k, house) for k in range(len(self.building.storeys))]
-        walls = [self._wall(k, storeys[self.building.wall_storeys[k]]) for k in range(len(self.building.walls_m))]
+        spans = {wall: span for k in range(len(storeys)) for wall, span in joined_spans(self.building, k).items()}
+        walls = [self._wall(k, storeys[self.building.wall_storeys[k]], spans[k]) for k in range(len(self.building.walls_m))]
         for k, wall in enumerate(self.building.opening_walls):
             self._opening(k, walls[wall])
         self._material([*walls, *self.file.by_type("IfcSlab")])
@@ -142,11 +144,19 @@ class _IfcWriter:
         )  # fmt: skip
         for room in rooms_on(self.building, k):
             self._space(room, storey, low, high)
-            if seen[0]:
-                self._slab(room, storey, k, "FLOOR", low)
-            if seen[1] and k + 1 == len(self.building.storeys):
-                self._slab(room, storey, k, "ROOF", high)
+        plate = floor_plate(self.building, k)
+        for rings in rings_of_parts(plate) if seen[0] else ():
+            self._slab(rings, storey, k, "FLOOR", low)
+        for rings in rings_of_parts(self._roof(plate, k)) if seen[1] else ():
+            self._slab(rings, storey, k, "ROOF", high)
         return storey
+
+    def _roof(self, plate: Any, k: int) -> Any:
+        """Return the area of a storey's plate that the floor of the storey above it leaves open, without slivers."""
+        if k + 1 == len(self.building.storeys) or not np.isfinite(self.building.storeys[k + 1, 0]):
+            return plate
+        open_area = plate.difference(floor_plate(self.building, k + 1))
+        return open_area.buffer(-SLIVER_M / 2.0, join_style="mitre").buffer(SLIVER_M / 2.0, join_style="mitre")
 
     def _space(self, room: int, storey: Any, low: float, high: float) -> None:
         space = self._entity("IfcSpace", f"room {room}")
@@ -169,19 +179,20 @@ class _IfcWriter:
             **self._evidence("room", room),
         )
 
-    def _slab(self, room: int, storey: Any, k: int, kind: str, height: float) -> None:
-        """Make the slab below a room's floor, or above its ceiling."""
+    def _slab(self, rings: list[F64], storey: Any, k: int, kind: str, height: float) -> None:
+        """Make a slab below a storey's floor, or above its ceiling."""
         below = float(self.building.storeys[k - 1, 1]) if k else float("nan")
         measured = kind == "FLOOR" and np.isfinite(below) and below < height
         thickness = height - below if measured else SLAB_M
-        slab = self._entity("IfcSlab", f"{kind.lower()} of room {room}")
+        slab = self._entity("IfcSlab", f"{kind.lower()} of storey {k}")
         slab.PredefinedType = kind
         self.api.spatial.assign_container(self.file, products=[slab], relating_structure=storey)
         self._place(slab, np.array([0.0, 0.0, height - thickness if kind == "FLOOR" else height]), np.array([1.0, 0.0]))
-        self._solid(slab, rings_of(self.building, room), thickness)
+        self._solid(slab, rings, thickness)
         self._properties(slab, ThicknessMeasured=bool(measured))
 
-    def _wall(self, k: int, storey: Any) -> Any:
+    def _wall(self, k: int, storey: Any, span: tuple[float, float]) -> Any:
+        """Make a wall from begin to end along it, which corners may lengthen; its axis has the measured length."""
         (start, end), thickness = self.building.walls_m[k], float(self.building.thickness_m[k])
         low, high = storey_levels(self.building, int(self.building.wall_storeys[k]))
         measured, length = bool(np.isfinite(thickness)), float(norm(end - start))
@@ -190,7 +201,8 @@ class _IfcWriter:
         self.api.spatial.assign_container(self.file, products=[wall], relating_structure=storey)
         self._place(wall, np.array([*start, low]), (end - start) / max(length, 1e-9))
         self._axis(wall, length, depth)
-        self._solid(wall, [np.array([[0.0, -depth], [length, -depth], [length, 0.0], [0.0, 0.0]])], high - low)
+        begin, stop = span
+        self._solid(wall, [np.array([[begin, -depth], [stop, -depth], [stop, 0.0], [begin, 0.0]])], high - low)
         offset, deep, turned = (float(value) for value in np.sqrt(np.diag(self.building.wall_covariance[k])))
         unseen = sum(float(row[2] - row[1]) for row in self.building.unseen if int(row[0]) == k)
         sigmas = {"OffsetSigma": offset, "ThicknessSigma": deep, "DirectionSigma": turned}

@@ -260,3 +260,44 @@ def test_the_ifc_has_axes_a_material_and_the_evidence(tmp_path):
     assert (found["OffsetSigma"], found["DirectionSigma"]) == (pytest.approx(0.01), pytest.approx(0.01))
     assert (found["Keyframes"], found["Frames"]) == (0, 1) and get_pset(walls[0], "Pset_WallCommon") is None
     assert get_pset(model.by_type("IfcOpeningElement")[0], "Trihedron_Measurement")["Frames"] == 1
+
+
+def meshes_of(path, *kinds):
+    """Name -> bounds (2, 3) and volume of the solids of a file, by IfcOpenShell's geometry, openings subtracted."""
+    import ifcopenshell
+    import ifcopenshell.geom
+    import trimesh
+
+    model, settings, found = ifcopenshell.open(path), ifcopenshell.geom.settings(), {}
+    settings.set("use-world-coords", True)
+    for shape in ifcopenshell.geom.iterator(settings, model, 1, include=[one for kind in kinds for one in model.by_type(kind)]):
+        mesh = trimesh.Trimesh(np.reshape(shape.geometry.verts, (-1, 3)), np.reshape(shape.geometry.faces, (-1, 3)))
+        found[model.by_id(shape.id).Name] = mesh.bounds, mesh.volume
+    return found
+
+
+def test_walls_of_the_ifc_meet_at_corners_and_stand_on_one_slab(tmp_path):
+    solids = meshes_of(th.Building(two_rooms()).to_ifc(tmp_path / "model.ifc"), "IfcWall", "IfcSlab")
+    walls = [shapely.box(*low[:2], *high[:2]) for name, ((low, high), _) in solids.items() if name.startswith("wall")]
+    ring = shapely.box(-0.06, -0.06, 8.16, 3.06) - shapely.box(0.0, 0.0, 4.0, 3.0) - shapely.box(4.1, 0.0, 8.1, 3.0)
+    assert shapely.union_all(walls).symmetric_difference(ring).area == pytest.approx(0.0, abs=1e-6)
+    assert sum(wall.area for wall in walls) == pytest.approx(ring.area, abs=1e-6)  # none is in another
+    assert solids["wall 0"][1] == pytest.approx(0.1 * (3.06 * 2.5 - 0.9 * 2.1), abs=1e-6)  # it takes one corner; the door is a hole
+    for name, low, high in (("floor of storey 0", -0.2, 0.0), ("roof of storey 0", 2.5, 2.7)):
+        assert solids[name][0] == pytest.approx(np.array([[-0.06, -0.06, low], [8.16, 3.06, high]]), abs=1e-6)
+
+
+@pytest.mark.parametrize(("shift", "roofs"), [(0.0, {"roof of storey 0", "roof of storey 1"}), (-4.1, {"roof of storey 1"})], ids=["beside", "above"])
+def test_a_storey_has_a_roof_where_no_other_is_above_it(tmp_path, shift, roofs):
+    building = two_rooms()
+    corners, walls = building.corners_m.copy(), building.walls_m.copy()
+    corners[4:, 0] += shift
+    walls[4:, :, 0] += shift
+    upper = replace(
+        building, corners_m=corners, walls_m=walls, storeys=np.array([[0.0, 2.5], [2.8, 5.3]]), storey_covariance=np.full((2, 2, 2), 1e-4),
+        wall_storeys=np.array([0, 0, 0, 0, 1, 1, 1], np.int32), room_storeys=np.array([0, 1], np.int32),
+        corner_walls=np.array([1, 0, 2, 3, 4, 5, 6, -1], np.int32),
+    )  # fmt: skip
+    slabs = meshes_of(th.Building(upper).to_ifc(tmp_path / "model.ifc"), "IfcSlab")
+    assert {name for name in slabs if name.startswith("roof")} == roofs
+    assert slabs["floor of storey 1"][0][:, 2] == pytest.approx((2.5, 2.8)) and slabs["roof of storey 1"][0][:, 2] == pytest.approx((5.3, 5.5))
