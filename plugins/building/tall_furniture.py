@@ -27,7 +27,7 @@ PRIORS = {"backed": 0.95, "behind": 0.25, "narrow": 0.6, "alone": 0.75}  # proba
 MISTAKEN = 0.02  # how often a view is thought to look over a wall
 COLUMN_M = (0.3, 0.45)  # widths of columns; furniture as high as a man is seldom as narrow
 KNOWN = 0.8  # probability, without what is behind, from which a stretch is a wall by which others are judged
-DEEPEST_M, USUAL_DEPTH_M = 1.0, 0.6  # of furniture
+DEEPEST_M, USUAL_DEPTH_M, USUAL_WALL_M = 1.0, 0.6, 0.1  # of furniture, of a wall
 THIN_M = 0.2  # what is nearer to a wall that is seen on both its sides, a curtain or a pilaster, is no wall
 BESIDE_M = 1.5  # from the end of a front to the strip of wall beside it
 STRIP_M = 0.15  # least strip of wall that is seen behind the line of a front
@@ -162,16 +162,22 @@ def _is_backed(face: Face, one: Stretch, faces: list[Face]) -> bool:
 
 
 def _depth_to_wall(face: Face, one: Stretch, faces: list[Face]) -> float | None:
-    """Return how far behind the line of a stretch a strip of a wall is seen, beside or above it; None where none is."""
-    begin, end, found = face.start_m + CELL_M * one.begin - BESIDE_M, face.start_m + CELL_M * one.end + BESIDE_M, list[float]()
+    """Return how far behind the line of a stretch there is a wall: a strip of it is seen beside or above the stretch, or its other side, which is
+    farther behind than walls are thick; None where there is none."""
+    begin, end = face.start_m + CELL_M * one.begin, face.start_m + CELL_M * one.end
+    strips, backs = list[float](), list[float]()
     for other in faces:
-        depth = face.offset_m - other.offset_m
-        if other is face or float(matmul(other.normal, face.normal)) < 0.999 or not 0.03 < depth < DEEPEST_M:
+        same = float(matmul(other.normal, face.normal))
+        depth = face.offset_m - np.sign(same) * other.offset_m
+        if other is face or abs(same) < 0.999:
             continue
-        first, stop = other.column_at(begin), other.column_at(end)
-        if other.known[max(first, 0) : max(stop, 0)].sum() * CELL_M >= STRIP_M:
-            found.append(depth)
-    return min(found, default=None)
+        if same > 0.0 and 0.03 < depth < DEEPEST_M:
+            first, stop = other.column_at(begin - BESIDE_M), other.column_at(end + BESIDE_M)
+            if other.known[max(first, 0) : max(stop, 0)].sum() * CELL_M >= STRIP_M:
+                strips.append(depth)
+        elif same < 0.0 and THICKEST_M < depth < DEEPEST_M and other.share(-end, -begin, other.known) > 0.5:
+            backs.append(depth - USUAL_WALL_M)
+    return min(strips or backs, default=None)
 
 
 def _wall_on_both_sides(face: Face, one: Stretch, depth: float, faces: list[Face]) -> bool:
