@@ -68,7 +68,7 @@ def add_view(
         newest, state.keyframes = len(map.keyframes), max(state.keyframes, len(map.keyframes))
         wanted = newest > 0 and int(map.keyframes.rows("index", np.array([newest - 1]))[0]) == frame.index
     else:
-        wanted = state.keyframes == 0 and (not state.views or _has_moved(state.views[-1].T_world_camera, pose.T_world_camera))
+        wanted = state.keyframes == 0 and (not state.views or has_moved(state.views[-1].T_world_camera, pose.T_world_camera))
     if wanted:
         view = view_of(frame, planes, pose, map, options.view_width, options.max_sigma_m)
         state.views.append(replace(view, color=view.color[:0, :0].copy()))
@@ -76,7 +76,7 @@ def add_view(
     return state
 
 
-def _has_moved(before: F64, now: F64) -> bool:
+def has_moved(before: F64, now: F64) -> bool:
     """Say if a pose (4, 4) is far enough from another to be kept."""
     turned = np.arccos(np.clip((np.trace(matmul(before[:3, :3].T, now[:3, :3])) - 1.0) / 2.0, -1.0, 1.0))
     return bool(norm(now[:3, 3] - before[:3, 3]) > MOVED_M or turned > np.radians(TURNED_DEG))

@@ -358,6 +358,18 @@ def test_a_benchmark_that_was_stopped_goes_on(tmp_path, monkeypatch):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["flat.kinect.0", "flat.kinect.1"]
 
 
+def test_the_benchmark_makes_plans_at_true_poses(capsys):
+    assert building_benchmark.main(["--scenes", "offices", "--sensors", "kinect", "--seeds", "1", "--fps", "5", "--true-poses"]) == 0
+    first, second = capsys.readouterr().out.strip().split("\n\n")
+    offices = dict(zip(building_benchmark.HEADER, first.splitlines()[1].split()))
+    assert (
+        offices["scene"] == "offices" and offices["recall"] == offices["precision"] == offices["doors"] == "1.00" and float(offices["wall cm"]) < 0.5
+    )
+    assert offices["frame ms"] == "-"
+    published = dict(zip(building_benchmark.PUBLISHED_HEADER, second.splitlines()[1].split()))
+    assert published["room F1"] == published["corner F1"] == "1.000" and published["false"] == "0"
+
+
 def test_a_preview_is_a_plan_of_some_views(walk, offices):
     plugin = plugin_class("building", "manhattan_layout")()
     state = plugin.start()

@@ -7,7 +7,8 @@ its middle. "honest" is the share of errors of areas, wall offsets and storey he
 over the seeds, "honest" a mean. slanted_flat is laid out by atlanta_layout; the seed of random_flat and glazed_flat is the number of
 the flat, too. A second table
 has the measure of methods that are judged on Structured3D: rooms, corners and angles, and "area in 95 %", the share of rooms with an area in its
-interval; means over the runs with 95 % intervals (Student's t). A benchmark with --out that was stopped goes on where it was.
+interval; means over the runs with 95 % intervals (Student's t), and "false" the openings of all runs that are none. A benchmark with --out that was
+stopped goes on where it was. With --true-poses nothing is tracked: keyframes of the walk at their true poses show what the plan alone gets wrong.
 
 Example: trihedron benchmark building --scenes offices --seeds 2
 """
@@ -18,15 +19,22 @@ import json
 import shutil
 import statistics
 import tempfile
+import time
 from pathlib import Path
 
 import numpy as np
 
-from trihedron.comparison.building_errors import plan_errors_of_run
+from trihedron.comparison.building_errors import plan_errors, plan_errors_of_run
+from trihedron.datasets.simulation.synthetic import Scene, Sensor, Synthetic
 from trihedron.pipeline.core.errors import UsageError, did_you_mean
 from trihedron.pipeline.core.files import write_file
+from trihedron.pipeline.core.registry import load_plugins, plugin_class
 from trihedron.pipeline.core.text_table import table
+from trihedron.pipeline.core.types import Pose
 from trihedron.pipeline.sweep.paired_statistics import half_interval
+from trihedron.plugins.building.views import has_moved
+from trihedron.plugins.normals.integral_image import IntegralImage
+from trihedron.plugins.planes.connected_components import ConnectedComponents
 from trihedron.tools.arguments import Parser
 
 SCENES = ("offices", "rooms", "corridor", "flat", "slanted_flat", "house")
@@ -34,11 +42,26 @@ FLATS = ("random_flat", "glazed_flat")
 MORE = (*FLATS, "whole_floor")  # on demand
 LAYOUTS = {"slanted_flat": "atlanta_layout"}  # of the slot building; the other scenes have the graph's own
 SENSORS = ("kinect", "stereo")
+WIDTH, HEIGHT = 320, 240
+SIGMA = 1e-3  # m, rad, that true poses state
 HEADER = [
     "scene", "sensor", "runs", "wall cm", "angle °", "IoU", "recall", "precision", "doors", "precision", "area %", "height cm", "honest", "frame ms",
     "final s",
 ]  # fmt: skip
-PUBLISHED_HEADER = ["scene", "sensor", "runs", "room P", "room R", "room F1", "corner P", "corner R", "corner F1", "angle F1", "area in 95 %"]
+PUBLISHED_HEADER = [
+    "scene",
+    "sensor",
+    "runs",
+    "room P",
+    "room R",
+    "room F1",
+    "corner P",
+    "corner R",
+    "corner F1",
+    "angle F1",
+    "area in 95 %",
+    "false",
+]
 
 
 def main(argv: list[str]) -> int:
@@ -54,6 +77,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--fps", type=float, default=15.0, metavar="HZ", help="frames a second of the walks (default: 15)")
     parser.add_argument("--out", type=Path, metavar="FOLDER", help="keep the runs here; one that is there already is judged as it is")
     parser.add_argument("--anew", action="store_true", help="make the plans of runs anew from what they recorded; final s is then CPU time")
+    parser.add_argument("--true-poses", action="store_true", help="track nothing: make the plans at the true poses of the walk")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures of each run too")
     options = parser.parse_args(argv)
     if not 1 <= options.seeds <= 100:
@@ -72,7 +96,10 @@ def main(argv: list[str]) -> int:
                     for seed in range(options.first_seed, options.first_seed + options.seeds)
                 }
                 found[f"{scene} {sensor}"] = [
-                    _figures(_track_scene(scene, sensor, seed, options.fps, run), options.plugin, options.anew) for seed, run in runs.items()
+                    figures_at_true_poses(scene, sensor, seed, options.fps, options.plugin)
+                    if options.true_poses
+                    else _figures(_track_scene(scene, sensor, seed, options.fps, run), options.plugin, options.anew)
+                    for seed, run in runs.items()
                 ]
     print(f"{report(found)}\n\n{published_measure(found)}")
     if options.json:
@@ -96,10 +123,10 @@ def _track_scene(scene: str, sensor: str, seed: int, fps: float, out: Path) -> P
     if not (out / "timing.json").exists():
         unfinished = out.with_name(out.name + ".unfinished")
         shutil.rmtree(unfinished, ignore_errors=True)
-        words = ["dataset=synthetic", f"dataset.scene={scene}", f"dataset.sensor={sensor}", f"dataset.seed={seed}", "dataset.width=320"]
+        words = ["dataset=synthetic", f"dataset.scene={scene}", f"dataset.sensor={sensor}", f"dataset.seed={seed}", f"dataset.width={WIDTH}"]
         words += [f"building={LAYOUTS[scene]}"] if scene in LAYOUTS else []
         words += [f"dataset.flat={seed}"] if scene in FLATS else []
-        measure([*words, "dataset.height=240", f"dataset.fps={fps:g}", "outputs=[trajectory,building]", f"out={unfinished}"], unfinished)
+        measure([*words, f"dataset.height={HEIGHT}", f"dataset.fps={fps:g}", "outputs=[trajectory,building]", f"out={unfinished}"], unfinished)
         unfinished.rename(out)
     return out
 
@@ -112,6 +139,26 @@ def _figures(run: Path, plugin: str, anew: bool) -> dict[str, float]:
     return figures if plugin else figures | {"frame_ms": stage["p50_ms"]}
 
 
+def figures_at_true_poses(scene: str, sensor: str, seed: int, fps: float, plugin: str) -> dict[str, float]:
+    """Return the figures of the plan of keyframes at their true poses, with the CPU time of its completion."""
+    load_plugins()
+    dataset = Synthetic(
+        scene=Scene[scene], sensor=Sensor[sensor], seed=seed, flat=seed if scene in FLATS else 0, fps=fps, width=WIDTH, height=HEIGHT
+    )  # fmt: skip
+    fold = plugin_class("building", plugin or LAYOUTS.get(scene, "manhattan_layout"))()
+    state, last = fold.start(), None
+    for index in range(len(dataset)):
+        T = dataset.true_pose(index)
+        if (last is None or has_moved(last, T)) and (frame := dataset(index)) is not None:
+            last = T
+            planes = ConnectedComponents()(frame, IntegralImage()(frame))
+            pose = Pose(index, frame.stamp_ns, T, SIGMA**2 * np.eye(6), T, -1, np.zeros(3, np.int32), 0, "ok", "")
+            state = fold.add(state, frame, planes, None, pose, None)
+    began = time.process_time()
+    building = fold.finish(state, None)
+    return {"final_s": time.process_time() - began} | plan_errors(building, np.eye(4), dataset.plans())
+
+
 def published_measure(found: dict[str, list[dict[str, float]]]) -> str:
     """Return the table of rooms, corners and angles: means over the runs of each scene and sensor, and their 95 % intervals from three runs on."""
     columns = ("room_precision", "room_recall", "room_f1", "corner_precision", "corner_recall", "corner_f1", "angle_f1", "area_within")
@@ -122,8 +169,9 @@ def published_measure(found: dict[str, list[dict[str, float]]]) -> str:
             values = [run[name] for run in runs if np.isfinite(run.get(name, float("nan")))]
             half = half_interval(values) if len(values) > 2 else None
             cells.append((f"{statistics.mean(values):.3f}" if values else "-") + (f" ± {half:.3f}" if half is not None else ""))
-        rows.append([*scene.split(), str(len(runs)), *cells])
-    return table(rows, "llr" + "r" * len(columns))
+        false = [run["false_openings"] for run in runs if "false_openings" in run]
+        rows.append([*scene.split(), str(len(runs)), *cells, f"{sum(false):.0f}" if false else "-"])
+    return table(rows, "llr" + "r" * (len(columns) + 1))
 
 
 def report(found: dict[str, list[dict[str, float]]]) -> str:

@@ -75,6 +75,12 @@ def plan_errors(building: Building, T_truth_world: F64, plans: list[TruePlan]) -
         "room_precision": len(pairs) / len(mine) if mine else float("nan"),
         "door_recall": doors / doorways if doorways else float("nan"),
         "door_precision": doors / (doors + false) if doors + false else float("nan"),
+        "false_openings": float(
+            sum(
+                _false_openings(building, plan, T, building.wall_storeys[building.opening_walls] == storey)
+                for storey, plan in _storey_plan_pairs(at, plans)
+            )
+        ),
         "area_error": _median([abs(error) / truth[b][2].area for error, (_, b) in zip(areas, pairs)]),
         "area_within": float(np.mean(within)) if within else float("nan"),
         "height_m": _median([abs(error) for error, _ in heights]),
@@ -171,11 +177,21 @@ def _doors(building: Building, plan: TruePlan, T: F64, chosen: Bool) -> tuple[in
     """Return the number of true doorways that were found among the chosen openings, and of doors and passages that are none."""
     from trihedron.pipeline.core.types import OPENING_KINDS
 
-    middles = []
-    for wall, span, kind in zip(building.opening_walls[chosen], building.spans_m[chosen], building.opening_kinds[chosen]):
-        start, end = _transform_to_truth(building.walls_m[wall], T)
-        if OPENING_KINDS[kind] != "window":
-            middles.append(start + (end - start) / np.linalg.norm(end - start) * span.mean())
+    middles = _middles(building, T, chosen & (building.opening_kinds != OPENING_KINDS.index("window")))
     hits = {k for k, door in enumerate(plan.doorways) for middle in middles if np.linalg.norm(door.middle - middle) < DOOR_M}
-    false = sum(all(np.linalg.norm(door.middle - middle) >= DOOR_M for door in plan.doorways) for middle in middles)
-    return len(hits), false
+    return len(hits), sum(all(np.linalg.norm(door.middle - middle) >= DOOR_M for door in plan.doorways) for middle in middles)
+
+
+def _false_openings(building: Building, plan: TruePlan, T: F64, chosen: Bool) -> int:
+    """Return the number of chosen openings of any kind that are neither a true doorway nor a true window."""
+    true = [*plan.doorways, *plan.windows]
+    return sum(all(np.linalg.norm(gap.middle - middle) >= DOOR_M for gap in true) for middle in _middles(building, T, chosen))
+
+
+def _middles(building: Building, T: F64, chosen: Bool) -> list[F64]:
+    """Return the middles (2,) of chosen openings on the plan of the truth."""
+    found = []
+    for wall, span in zip(building.opening_walls[chosen], building.spans_m[chosen]):
+        start, end = _transform_to_truth(building.walls_m[wall], T)
+        found.append(start + (end - start) / np.linalg.norm(end - start) * span.mean())
+    return found
