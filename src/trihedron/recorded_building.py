@@ -44,20 +44,23 @@ def fold_recording(recording: Recording, name: str) -> tuple[Any, Any, Map | Non
         raise DataError(str(recording.path), "holds no planes", "record a run of a graph with planes")
     frame_of, references, final = frames_of(recording), references_of(recording), last_map(recording)
     poses: dict[int, Pose] = {pose.index: pose for pose in poses_of(recording)}
-    others = {topic: {v.index: v for v in recording.values(topic) if topic == "map"} for topic in ("map",) if topic in recording.topics}
-    maps = others.get("map", {})
+    maps = recording.values("map") if "map" in recording.topics else iter(())
+    newest = next(maps, None)  # one at a time: those of a long recording do not fit into memory together
     fold = plugin_class("building", name)()
     state = fold.start()
     rotations = {v.index: v for v in recording.values("rotation")} if "rotation" in recording.topics else {}
-    wanted = set(maps) if maps else set(poses)
+    every = newest is None
     given = ("frame", "planes", "rotation", "pose", "map")
     for planes in recording.values("planes"):
         index = planes.index
-        if index not in wanted or index not in poses or index not in references:
+        while newest is not None and newest.index < index:
+            newest = next(maps, None)
+        current = newest if newest is not None and newest.index == index else None
+        if not (every or current is not None) or index not in poses or index not in references:
             continue
         frame = frame_of(references[index])
         if frame is not None:
-            values = dict(zip(given, (frame, planes, rotations.get(index), poses[index], maps.get(index))))
+            values = dict(zip(given, (frame, planes, rotations.get(index), poses[index], current)))
             check_together(values, str(recording.path), {topic: topic for topic in given})
             state = fold.add(state, **values) if name != "none" else fold.add(state, pose=values["pose"])
     return fold, state, final

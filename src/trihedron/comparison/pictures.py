@@ -138,12 +138,14 @@ def _map_from_above(axes: Any, recording: Recording, poses: list[Any]) -> None:
     """Landmarks and the path, seen along the scene's vertical as far as the first camera knows it (y down)."""
     import numpy as np
 
-    versions: list[Any] = list(recording.values("map")) if "map" in recording.topics else []
+    from trihedron.pipeline.app.recorded_values import last_map
+
+    final = last_map(recording)
     path = np.array([pose.T_world_camera[:3, 3] for pose in poses])
     shown = [path[:, [0, 2]]]
-    if versions:
-        _landmarks(axes, versions[-1])
-        points = versions[-1].points.column("position_m")[versions[-1].points.column("alive")]
+    if final is not None:
+        _landmarks(axes, final)
+        points = final.points.column("position_m")[final.points.column("alive")]
         if len(points):
             shown.append(np.percentile(points[:, [0, 2]], FRAMED, axis=0))
     low, high = np.concatenate(shown).min(axis=0) - MARGIN_M, np.concatenate(shown).max(axis=0) + MARGIN_M
