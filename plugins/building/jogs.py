@@ -20,6 +20,7 @@ SHORT_M = 0.2  # least wall that meets the ceiling: the side of a niche, a colum
 MOSTLY_BEHIND = 0.3  # of the levels at which the face behind is read, fewer than which the front is read beyond its end
 END_M = 0.25  # of a face, whose readings say where it ends
 WIDEST_DOOR_M = 1.6
+CORRIDOR_M = 0.6  # of the walls of a corridor on either side of what meets them
 THICKEST_M = 0.3  # wall between two faces
 SAME_SIDE_M = 0.12  # from a face that was found
 
@@ -41,14 +42,24 @@ def jog_sides(faces: list[Face], evidence: Evidence) -> list[Face]:
 
 
 def parting_columns(face: Face, faces: list[Face]) -> Bool:
-    """Return the columns (k,) of a face that part rooms: the tall ones, and gaps between them as wide as a door unless a face close behind shows that
-    they are niches."""
+    """Return the columns (k,) of a face that part rooms: the tall ones, and gaps between them as wide as a door unless they are niches, as a face close
+    behind shows, or a corridor between two walls that are square to the face."""
     out = face.tall.copy()
     for (_, a), (b, _) in pairwise(runs_of(face.tall)):
         niche = any(_is_read_beyond(face, other, a, True) or _is_read_beyond(face, other, b, False) for other in faces)
-        if (b - a) * CELL_M <= WIDEST_DOOR_M and not niche:
+        corridor = all(any(_faces_gap(face, other, end, sign) for other in faces) for end, sign in ((a, 1.0), (b, -1.0)))
+        if (b - a) * CELL_M <= WIDEST_DOOR_M and not niche and not corridor:
             out[a:b] = True
     return out
+
+
+def _faces_gap(face: Face, other: Face, column: int, sign: float) -> bool:
+    """Say if the other face is a wall at an end of a gap in a face, looks into the gap, and goes on before the face and behind it."""
+    at = face.start_m + CELL_M * column
+    if sign * float(matmul(other.normal, face.along)) < 0.999 or abs(sign * other.offset_m - at) > SAME_SIDE_M:
+        return False
+    crossing = float(matmul(face.offset_m * face.normal + at * face.along, other.along))
+    return all(other.share(min(crossing, far), max(crossing, far), other.tall) > 0.5 for far in (crossing - CORRIDOR_M, crossing + CORRIDOR_M))
 
 
 def _is_read_beyond(front: Face, other: Face, column: int, at_end: bool) -> bool:

@@ -28,7 +28,7 @@ from trihedron.plugins.building.free_space import FreeSpace
 from trihedron.plugins.building.free_space_kernels import LEVELS
 from trihedron.plugins.building.geometry import wall_pieces
 from trihedron.plugins.building.ifc import has_ifc, write_ifc
-from trihedron.plugins.building.jogs import jog_sides
+from trihedron.plugins.building.jogs import jog_sides, parting_columns
 from trihedron.plugins.building.openings import fit_jambs, widest_gap
 from trihedron.plugins.building.svg import floorplan_svg
 from trihedron.plugins.building.tall_furniture import Stretch, wall_probability
@@ -475,6 +475,24 @@ def test_the_side_of_a_column_may_hide_some_of_the_wall_beside_it(hidden, sides)
     for side in found:  # from the front to the wall
         ends = side.start_m, side.start_m + 0.05 * len(side.count)
         assert sorted(abs(end) for end in ends) == pytest.approx([0.0, 0.35], abs=0.03)
+
+
+def wall_face(normal: tuple[float, float], offset_m: float, runs: list[tuple[float, float]]) -> Face:
+    """A face that is read, floor to ceiling, between places along it."""
+    start = runs[0][0]
+    count = np.zeros((round((runs[-1][1] - start) / 0.05), LEVELS), np.int32)
+    for begin, end in runs:
+        count[round((begin - start) / 0.05) : round((end - start) / 0.05)] = 1
+    return Face(np.array(normal), offset_m, start, count, count.any(axis=1), np.empty(0, np.int64))
+
+
+def test_a_gap_between_walls_is_a_door_unless_a_corridor_goes_through():
+    """A wall along x with a gap of 1.5 m; walls along y at both ends of the gap, that look into it, are those of a corridor."""
+    wall = wall_face((0.0, 1.0), 0.0, [(-2.0, 0.0), (1.5, 4.0)])
+    west, east = wall_face((1.0, 0.0), 0.0, [(-3.0, 3.0)]), wall_face((-1.0, 0.0), -1.5, [(-3.0, 3.0)])
+    before, behind = wall_face((1.0, 0.0), 0.0, [(-3.0, 0.0)]), wall_face((-1.0, 0.0), -1.5, [(0.0, 3.0)])
+    assert parting_columns(wall, [wall]).all() and parting_columns(wall, [wall, before, behind]).all()
+    assert not parting_columns(wall, [wall, west, east])[41:69].any() and parting_columns(wall, [wall, west]).all()
 
 
 def test_lines_that_are_nearly_one_part_no_room():
