@@ -5,7 +5,8 @@ python examples/camera_loop.py my_recording         # a folder with rgb/, depth/
 python examples/camera_loop.py realsense            # Intel RealSense: pip install 'trihedron[realsense]'
 python examples/camera_loop.py oak                  # Luxonis OAK-D: pip install 'depthai>=3'
 
-Ctrl-C ends a camera. The run folder is runs/camera. Words after the source are those of the command line, as view=foxglove.
+Ctrl-C ends a camera. The run folder is runs/camera, over that of the last walk, else out=FOLDER. Words after the source are those of the command
+line, as view=foxglove.
 """
 
 from __future__ import annotations
@@ -123,7 +124,8 @@ def command(*words: str) -> None:
     if {"-h", "--help"} & set(words):
         return print(__doc__)
     try:
-        main(*words)
+        out = [word[4:] for word in words if word.startswith("out=")]
+        main(*(word for word in words if not word.startswith("out=")), **({"out": out[-1]} if out else {}))
     except ModuleNotFoundError as error:
         sys.exit(f"camera_loop: {error.name}: is not installed; install it with: {MAKERS.get(error.name or '', f'pip install {error.name}')}")
     except (th.TrihedronError, ImportError) as error:

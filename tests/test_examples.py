@@ -92,6 +92,14 @@ def test_camera_loop_names_a_missing_library_and_its_cure(monkeypatch, program, 
     assert str(caught.value) == f"camera_loop: {line}"
 
 
+def test_camera_loop_writes_where_it_is_told(monkeypatch):
+    module, calls = example("camera_loop"), []
+    monkeypatch.setattr(module, "track", lambda source, out, *words: calls.append((out, *words)))
+    module.command("room", "out=runs/walk", "threads=1")
+    module.command("room", "threads=1")
+    assert calls == [("runs/walk", "threads=1"), ("runs/camera", "threads=1")]
+
+
 def test_camera_loop_prints_its_help(capsys):
     example("camera_loop").command("--help")
     assert "python examples/camera_loop.py realsense " in capsys.readouterr().out

@@ -23,6 +23,7 @@ MEANINGS = {
     "dimension": "between the inner faces of walls, m",
 }
 THIN = "thin walls: the other face was not seen"
+FIGURES = "after ±: standard deviation; in parentheses: 95 % interval"
 LINE, SWATCH, NARROWEST = 14.0, 26.0, 380.0  # points: between lines, wide a swatch, for the lines of text
 SMALL = 20.0  # points a metre, of a scale whose bar is in steps of five metres
 FIRST_DATE_S = 946684800  # 2000-01-01; stamps before it are no times of day
@@ -42,7 +43,7 @@ def legend_groups(building: Building, per_m: float, listed: list[str], width: fl
     wide = max(width, NARROWEST)
     sentences = [*storey_sentences(building), *([building.note] if building.note else [])]
     thin = "wall" in styles and bool(np.isnan(building.thickness_m).any())
-    sentences += [THIN] if thin else []
+    sentences += [*([THIN] if thin else []), *([FIGURES] if len(building.areas_m2) else [])]
     for text in [*sentences, *(f"{number}: {text}" for number, text in enumerate(listed, 1))]:
         for part in textwrap.wrap(text, int(wide / width_of("x", "note"))):
             marks.append(text_from("note", part, 0.0, y))

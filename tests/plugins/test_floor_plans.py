@@ -21,6 +21,7 @@ from trihedron.pipeline.core.types import OPENING_KINDS, Building
 from trihedron.pipeline.record.writer import RecordingWriter
 from trihedron.plugins.building.dimensions import chains_of
 from trihedron.plugins.building.geometry import box_place
+from trihedron.plugins.building.legend import FIGURES
 from trihedron.plugins.building.pdf import write_pdf
 from trihedron.plugins.building.plan_drawing import draw_plan
 from trihedron.plugins.building.sheet import FONTS, Letters, Shape, Sheet
@@ -120,7 +121,7 @@ def test_a_box_lies_where_it_is_farthest_from_the_outline():
 def test_the_legend_says_in_words_what_is_drawn():
     texts = texts_of(with_window(two_rooms()))
     legend = ["wall, seen", "wall, completed where it was not seen", "window", "door; which way it turns was not measured"]
-    assert set([*legend, "between the inner faces of walls, m", "thin walls: the other face was not seen", "N: first view"]) <= set(texts)
+    assert set([*legend, "between the inner faces of walls, m", "thin walls: the other face was not seen", "N: first view", FIGURES]) <= set(texts)
     assert "floor of storey 0: 24.00 m² in 2 rooms (24.0 to 24.0); floor 0.00 m, ceiling 2.50 m" in texts
     open_room = replace(two_rooms(), corner_walls=np.array([1, 0, -1, 3, 4, 5, 6, 0], np.int32))
     assert "not seen: nothing is known to bound the room there" in texts_of(open_room) and "window" not in texts_of(two_rooms())
