@@ -42,8 +42,8 @@ def jog_sides(faces: list[Face], evidence: Evidence) -> list[Face]:
 
 
 def parting_columns(face: Face, faces: list[Face]) -> Bool:
-    """Return the columns (k,) of a face that part rooms: the tall ones, and gaps between them as wide as a door unless they are niches, as a face close
-    behind shows, or a corridor between two walls that are square to the face."""
+    """Return the columns (k,) of a face that part rooms: the tall ones, and gaps between them as wide as a door unless they are niches, as a face
+    close behind shows, or a corridor between two walls that are square to the face."""
     out = face.tall.copy()
     for (_, a), (b, _) in pairwise(runs_of(face.tall)):
         niche = any(_is_read_beyond(face, other, a, True) or _is_read_beyond(face, other, b, False) for other in faces)
