@@ -1,7 +1,12 @@
 """What a newcomer gets wrong: each mistake is one line with place, cause and cure, and the exit code that the README says; never a traceback."""
 
+import warnings
+
+import cv2
+import numpy as np
 import pytest
 
+import trihedron as th
 from trihedron.pipeline.app.cli import main
 
 TYPE, SEE = "give a value of that type", "see trihedron plugins"
@@ -110,6 +115,24 @@ def test_a_mistake_is_one_line(here, monkeypatch, capsys, words, code, line):
     assert printed.err == f"trihedron: {line.format(here=here)}\n"
     assert not printed.out
     assert sorted(path.name for path in here.iterdir()) == FILES  # a refused run leaves no folder behind
+
+
+def test_depth_in_fifths_of_millimetres_taken_for_metres_is_named_and_loses_the_frames(tmp_path, capsys):
+    room = th.dataset.synthetic(width=160, height=120, length=8)
+    camera = room(0).camera
+    for folder, image in (("rgb", lambda frame: frame.color), ("depth", lambda frame: np.rint(5000 * frame.depth_m).astype(np.uint16))):
+        (tmp_path / folder).mkdir()
+        for k in range(8):
+            cv2.imwrite(str(tmp_path / folder / f"{k:06d}.png"), image(room(k)))
+    numbers = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy", "fps")} | {"depth_scale": 1}
+    (tmp_path / "camera.yaml").write_text("".join(f"{name}: {value}\n" for name, value in numbers.items()))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # of NumPy
+        assert main(["run", str(tmp_path), f"out={tmp_path}/run"]) == 0
+    printed = capsys.readouterr()
+    assert "millimetres taken for metres; give a depth_scale 1000 times as large" in printed.err
+    assert "are beyond 1000 m and count as missing; is the depth_scale of the camera right?\n" in printed.err.splitlines(True)[-1]
+    assert "frames: 1 ok, 7 lost\n" in printed.out
 
 
 def test_the_table_is_long_enough():

@@ -125,7 +125,7 @@ ADVERSE: dict[str, Callable[[Frame], Frame]] = {
     "nothing at all": lambda frame: replace(frame, color=np.zeros_like(frame.color), depth_m=np.zeros_like(frame.depth_m)),
     "noise": _noise,
     "one row of depth": _one_row,
-    "depth of kilometres": lambda frame: replace(frame, depth_m=frame.depth_m * np.float32(1000.0)),
+    "depth of hundreds of metres": lambda frame: replace(frame, depth_m=frame.depth_m * np.float32(100.0)),
 }
 REPEATED = "a frame that repeats"
 FEW: dict[str, dict[str, str]] = {  # scenes in which other stages find little: slot -> word
