@@ -43,7 +43,7 @@ def refused(capsys, *words, code=1):
 PATHS = "give a folder, a .mcap, .bag or .r3d file, or key=value (quote lists: 'only=[pose]')"
 SEE = "see trihedron plugins"
 MISTAKES = [
-    (["threads=abc"], 1, "trihedron: threads: Value 'abc' of type 'str' could not be converted to Integer; give a value of that type"),
+    (["threads=abc"], 1, "trihedron: threads: 'abc' is not a whole number (default 2); see trihedron run --help"),
     (["threads=0"], 1, "trihedron: threads: 0 is not a number of threads; give 1 to 256"),
     (["threds=1"], 1, "trihedron: threds: there is no such key; did you mean 'threads'?"),
     (["keypoints=orbs"], 1, "trihedron: keypoints: there is no plugin 'orbs' for the slot 'keypoints'; did you mean 'orb'?"),
@@ -75,7 +75,7 @@ MISTAKES = [
     (["only=[pose]"], 1, "trihedron: only: chooses stages of a replay, and there is none; give replay=FILE.mcap too"),
     (["replay=no.mcap"], 1, "trihedron: no.mcap: cannot be read: No such file or directory; give the path of an MCAP file"),
     (["record.topics=[normal]"], 1, "trihedron: record.topics: no stage writes 'normal'; did you mean 'normals'?"),
-    (["feedback=old"], 1, "trihedron: feedback: Invalid value 'old', expected one of [new, recorded]; give a value of that type"),
+    (["feedback=old"], 1, "trihedron: feedback: 'old' is not one of new, recorded (default new); see trihedron run --help"),
     (["out=/proc/no"], 1, "trihedron: out: the folder cannot be made: No such file or directory: /proc/no; give another out=FOLDER"),
     (["/no/pose"], 2, f"trihedron: /no/pose: is not key=value, and there is no such path; {PATHS}"),
     (["-x"], 2, "trihedron: -x: is not an option of run; known: -m, --multirun, --dry-run; everything else is key=value"),
