@@ -41,6 +41,7 @@ from trihedron.pipeline.run.runner import Runner
 from trihedron.pipeline.run.scheduler import single_threaded_libraries
 from trihedron.tools.judged_calls import Call, Figure, figures_of_frames, worst
 from trihedron.tools.meanings import meanings_of
+from trihedron.tools.new_plugin import TEMPLATE_SENTENCE
 from trihedron.tools.plugins import first_sentence
 
 ROOM = ("dataset=synthetic", "dataset.width=320", "dataset.height=240", "dataset.length=8")
@@ -195,6 +196,8 @@ class PluginCheck:
         ]
         if not own or not re.match(r"[A-Z`'\"]", text) or text.startswith(CLAUSES):
             return Result("documented", False, "the class has no docstring that opens with what it does")
+        if text.partition("\n")[0] == TEMPLATE_SENTENCE:
+            return Result("documented", True, "the docstring is the template's; state what the method computes", judged=False)
         if silent:
             return Result("documented", False, f"neither a range nor a comment: {', '.join(silent)}")
         return Result("documented", True, f"{len(options_of(kind))} options")
