@@ -40,13 +40,14 @@ from trihedron.pipeline.run.interrupts import defer_interrupts
 from trihedron.pipeline.run.live import Pace, shows_once
 from trihedron.pipeline.run.map_file import load_map, save_map
 from trihedron.pipeline.run.replay import TOPICS, Replay
-from trihedron.pipeline.run.run_folder import RECORDING, FolderBefore, lock_folder, point_latest, write_configuration
+from trihedron.pipeline.run.run_folder import FolderBefore, lock_folder, point_latest, write_configuration
 from trihedron.pipeline.run.runner import Runner, Step
 from trihedron.pipeline.run.state import DelayLines, max_delays
 from trihedron.pipeline.run.stated_sigma import sigma_line
 from trihedron.pipeline.run.timing import forget_peak
 from trihedron.pipeline.run.warm_up import compilation_reported, warm_up
 
+RECORDING = "run.mcap"
 NETWORKS = tuple(f"{slot}.model" for slot in SLOTS)  # files of networks, of the plugins that run one
 READ_PATHS = ("dataset.path", "dataset.camera", "dataset.options.path", "dataset.options.camera", "load_map", "building.edits", *NETWORKS)
 PLAIN_PROGRESS_SECONDS = 5.0
@@ -81,7 +82,7 @@ def _execute(config: DictConfig, out: Path, overrides: list[str], began: float, 
     topics = recorded_topics(config, graph, replay)
     _announce(runner)
     trial = partial(Runner, graph, config.seed, config.threads, replay, frames, remembered)
-    before = FolderBefore.of(out)
+    before = FolderBefore.of(out / RECORDING)
     with lock_folder(out), _removed_without_frames(runner, before):
         compile_once(runner.computed, runner.count if runner.feed is None else None)
         write_configuration(out, config, overrides)

@@ -299,7 +299,8 @@ def rewrite_error(error: Exception) -> TrihedronError:
 
 def _wrong_type(error: ValidationError, text: str) -> ConfigError:
     """Return the error of a value of another type than its option's: the kind, range and default of that."""
-    key, owner = str(error.full_key or text.partition("=")[0].rpartition(" ")[2]), error.object_type
+    key = str(error.full_key or text.partition("=")[0].rpartition(" ")[2])
+    owner: Any = error.object_type
     slot, constraints, cure = key.partition(".")[0], "", "see trihedron run --help"
     if slot in SLOTS and isinstance(error.parent_node, DictConfig) and PLUGIN_KEY in error.parent_node:
         owner = plugin_class(slot, name := str(error.parent_node[PLUGIN_KEY]))

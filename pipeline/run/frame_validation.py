@@ -36,7 +36,8 @@ NEAR_M, FAR_M = 0.7, 8.0  # half of the readings nearer, or farther: no room of 
 
 
 def usable(frame: Frame) -> Frame | None:
-    """Return the frame with readings that are no distance (NaN, infinite, negative, beyond `FARTHEST_M`) as missing; None where camera and images differ in size."""
+    """Return the frame with readings that are no distance (NaN, infinite, negative, beyond `FARTHEST_M`) as missing; None where camera and images
+    differ in size."""
     camera, depth, (h, w) = frame.camera, frame.depth_m, frame.depth_m.shape
     if (camera.width, camera.height) != (w, h):
         log.warning("frame %d: its images are %d×%d while the camera is %d×%d; it is skipped", frame.index, w, h, camera.width, camera.height)

@@ -17,7 +17,6 @@ from trihedron.pipeline.core.errors import ConfigError, DataError
 from trihedron.pipeline.core.files import make_folder, write_file
 
 CONFIG = ".hydra"  # folder of the composed configuration and the words it was composed of
-RECORDING = "run.mcap"
 CURE = "give another out=FOLDER"
 
 
@@ -28,13 +27,15 @@ class FolderBefore:
     folder: Path
     missing: tuple[Path, ...]
     present: frozenset[Path]
-    recording: tuple[int, int] | None  # which file an older recording is
+    recording: Path
+    older: tuple[int, int] | None  # which file is there in its place
 
     @classmethod
-    def of(cls, folder: Path) -> FolderBefore:
-        """Look at a folder, which need not exist."""
+    def of(cls, recording: Path) -> FolderBefore:
+        """Look at the folder of a recording, neither of which need exist."""
+        folder = recording.parent
         missing = tuple(path for path in (folder, *folder.parents) if not path.exists())
-        return cls(folder, missing, frozenset(folder.iterdir() if folder.is_dir() else ()), _identity(folder / RECORDING))
+        return cls(folder, missing, frozenset(folder.iterdir() if folder.is_dir() else ()), recording, _identity(recording))
 
     def restore(self) -> None:
         """Remove what has been added, and a recording in the place of an older one."""
@@ -44,8 +45,7 @@ class FolderBefore:
                 for path in self.missing[1:]:
                     path.rmdir()
             return
-        recording = self.folder / RECORDING
-        replaced = {recording} if _identity(recording) != self.recording else set()
+        replaced = {self.recording} if _identity(self.recording) != self.older else set()
         with suppress(OSError):
             for path in {*self.folder.iterdir()} - self.present | replaced:
                 rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink(missing_ok=True)
