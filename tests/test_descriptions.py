@@ -134,7 +134,7 @@ def test_a_plan_is_drawn():
         edge_sigma_m=np.zeros(4), areas_m2=np.array([12.0]), area_variance=none, closed=np.zeros(1, bool),
     )  # fmt: skip
     building = th.Building(plan)
-    assert repr(building) == "Building(1 storey, 1 room, 1 wall, 0 openings of 12.00 ± 0.00 m²)"
+    assert repr(building) == "Building(1 storey, 1 room of 12.00 ± 0.00 m², 1 wall, 0 openings)"
     assert repr(building.rooms[0]).startswith("Room(number=0, storey=0, corners (4, 2), holes=(), edges=(") and len(repr(building.rooms[0])) < 300
     assert repr(building.walls[0].length_m) == "4.000 ± 0.000"
     page = building._repr_html_()

@@ -1,30 +1,35 @@
 """What a newcomer gets wrong: each mistake is one line with place, cause and cure, and the exit code that the README says; never a traceback."""
 
+import warnings
+
+import cv2
+import numpy as np
 import pytest
 
+import trihedron as th
 from trihedron.pipeline.app.cli import main
 
-TYPE, SEE = "give a value of that type", "see trihedron plugins"
+HELP, SEE = "see trihedron run --help", "see trihedron plugins"
 SOURCES = "give a folder, a .mcap, .bag or .r3d file"
 NO_PATH = f"is not key=value, and there is no such path in {{here}}; {SOURCES}, or key=value (quote lists: 'only=[pose]')"
 MCAP = "is not an MCAP file; give a file that trihedron run or another MCAP writer wrote"
 MISTAKES = [  # words of the command, exit code, what is said after "trihedron: "
-    ("run threads=abc", 1, f"threads: Value 'abc' of type 'str' could not be converted to Integer; {TYPE}"),
-    ("run threads=", 1, f"threads: Value '' of type 'str' could not be converted to Integer; {TYPE}"),
+    ("run threads=abc", 1, f"threads: 'abc' is not a whole number (default 2); {HELP}"),
+    ("run threads=", 1, f"threads: '' is not a whole number (default 2); {HELP}"),
     ("run threads=-1", 1, "threads: -1 is not a number of threads; give 1 to 256"),
     ("run dataset=tum dataset.path=~nobody_here/x", 1, "path: begins with ~ and the name of nobody; write ./~NAME for a file of that name"),
     ("run threads=100000", 1, "threads: 100000 is not a number of threads; give 1 to 256"),
     ("run seed=-1", 1, "seed: -1 is negative; give 0 or more"),
-    ("run seed=x", 1, f"seed: Value 'x' of type 'str' could not be converted to Integer; {TYPE}"),
+    ("run seed=x", 1, f"seed: 'x' is not a whole number (default 0); {HELP}"),
     ("run keypoints=orb,sift", 2, "keypoints: 'orb,sift' is several values; add -m to run once with each, or write a list as [A,B]"),
     ("run map=covisability", 1, "map: there is no plugin 'covisability' for the slot 'map'; did you mean 'covisibility'?"),
     ("run map.min_frames=-1", 1, f"map.min_frames: -1 is not at least 1; {SEE} map covisibility"),
     ("run pose.min_share=2", 1, f"pose.min_share: 2.0 is not within 0 … 1; {SEE} pose refine"),
-    ("run pose.min_share=high", 1, f"pose.min_share: Value 'high' of type 'str' could not be converted to Float; {TYPE}"),
+    ("run pose.min_share=high", 1, f"pose.min_share: 'high' is not a number that is within 0 … 1 (default 0.25); {SEE} pose refine"),
     ("run dataset.width=-5", 1, f"dataset.width: -5 is not within 16 … 8192; {SEE} dataset synthetic"),
-    ("run dataset.width=wide", 1, f"dataset.width: Value 'wide' of type 'str' could not be converted to Integer; {TYPE}"),
-    ("run dataset.width=3.5", 1, f"dataset.width: Value '3.5' of type 'float' could not be converted to Integer; {TYPE}"),
-    ("run dataset.motion=fly", 1, f"dataset.motion: Invalid value 'fly', expected one of [walk, fast, still, pan]; {TYPE}"),
+    ("run dataset.width=wide", 1, f"dataset.width: 'wide' is not a whole number that is within 16 … 8192 (default 640); {SEE} dataset synthetic"),
+    ("run dataset.width=3.5", 1, f"dataset.width: '3.5' is not a whole number that is within 16 … 8192 (default 640); {SEE} dataset synthetic"),
+    ("run dataset.motion=fly", 1, f"dataset.motion: 'fly' is not one of walk, fast, still, pan (default walk); {SEE} dataset synthetic"),
     ("run dataset.frames=5", 1, f"dataset.frames: '5' is not a range of frames A:B[:S] with A < B, S > 0; {SEE} dataset synthetic"),
     ("run dataset.frames=3:3", 1, f"dataset.frames: '3:3' is not a range of frames A:B[:S] with A < B, S > 0; {SEE} dataset synthetic"),
     ("run dataset.frames=500:", 1,
@@ -43,9 +48,15 @@ MISTAKES = [  # words of the command, exit code, what is said after "trihedron: 
     ("run graph.pose=none", 1, "graph.pose: 'none' is not the wires of a stage; choose a plugin with pose=NAME"),
     ("run graph.pose.foo=pose", 1, "graph.pose.foo: there is no such key; see trihedron run --help"),
     ("run outputs=trajectory", 1, "outputs: is not a list; write it as [A,B], quoted for the shell"),
+    ("run outputs=[trajectory", 2, "outputs=[trajectory: lacks ] at its end; write 'outputs=[trajectory]'"),
+    ("run planes.angle_deg=abc", 1,
+     f"planes.angle_deg: 'abc' is not a number that is above 0 and below 90 (default 3.0); {SEE} planes connected_components"),
+    ("check planes nope", 1,
+     "planes: there is no plugin 'nope' for the slot 'planes'; known: ahc, cape, connected_components, none, "
+     "onnx, open3d_patches, open3d_ransac, ransac"),
     ("run outputs=[surfce]", 1, "outputs: no stage writes 'surfce'; did you mean 'surface'?"),
-    ("run record.frames=maybe", 1, f"record.frames: Value 'maybe' is not a valid bool (type str); {TYPE}"),
-    ("run localise_only=perhaps", 1, f"localise_only: Value 'perhaps' is not a valid bool (type str); {TYPE}"),
+    ("run record.frames=maybe", 1, f"record.frames: 'maybe' is not true or false (default false); {HELP}"),
+    ("run localise_only=perhaps", 1, f"localise_only: 'perhaps' is not true or false (default false); {HELP}"),
     ("run localise_only=true", 1, "localise_only: needs a map to find the camera in; give load_map=FILE.mcap too"),
     ("run load_map=nowhere.mcap", 1, "nowhere.mcap: there is no such map; save one with: trihedron run save_map=FILE.mcap"),
     ("run load_map=junk.mcap", 1, f"junk.mcap: {MCAP}"),
@@ -65,6 +76,11 @@ MISTAKES = [  # words of the command, exit code, what is said after "trihedron: 
     ("run walk.r3d", 2, f"walk.r3d: {NO_PATH}"),
     ("run dataset.path", 2, f"dataset.path: {NO_PATH}"),
     ("run --dry-run", 2, "--dry-run: is of a sweep, and this is one run; add -m to run once with each of several values"),
+    ("run dataset.length=60 --out runs/a", 2, "--out: is not an option of run; write out=runs/a"),
+    ("run --dataset.length=60", 2, "--dataset.length: is not an option of run; write dataset.length=60"),
+    ("run --live small", 2, "--live: is not an option of run; write live=true"),
+    ("run --seed", 2, "--seed: is not an option of run; write seed=VALUE"),
+    ("run --title walk", 2, "--title: is not an option of run; it belongs to trihedron report and site"),
     ("run --verbose", 2, "--verbose: is not an option of run; known: -m, --multirun, --dry-run; everything else is key=value"),
     ("topics nowhere.mcap", 1, "nowhere.mcap: cannot be read: No such file or directory; give the path of an MCAP file"),
     ("topics junk.mcap", 1, f"junk.mcap: {MCAP}"),
@@ -110,6 +126,24 @@ def test_a_mistake_is_one_line(here, monkeypatch, capsys, words, code, line):
     assert printed.err == f"trihedron: {line.format(here=here)}\n"
     assert not printed.out
     assert sorted(path.name for path in here.iterdir()) == FILES  # a refused run leaves no folder behind
+
+
+def test_depth_in_fifths_of_millimetres_taken_for_metres_is_named_and_loses_the_frames(tmp_path, capsys):
+    room = th.dataset.synthetic(width=160, height=120, length=8)
+    camera = room(0).camera
+    for folder, image in (("rgb", lambda frame: frame.color), ("depth", lambda frame: np.rint(5000 * frame.depth_m).astype(np.uint16))):
+        (tmp_path / folder).mkdir()
+        for k in range(8):
+            cv2.imwrite(str(tmp_path / folder / f"{k:06d}.png"), image(room(k)))
+    numbers = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy", "fps")} | {"depth_scale": 1}
+    (tmp_path / "camera.yaml").write_text("".join(f"{name}: {value}\n" for name, value in numbers.items()))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # of NumPy
+        assert main(["run", str(tmp_path), f"out={tmp_path}/run"]) == 0
+    printed = capsys.readouterr()
+    assert "millimetres taken for metres; give a depth_scale 1000 times as large" in printed.err
+    assert "are beyond 1000 m and count as missing; is the depth_scale of the camera right?\n" in printed.err.splitlines(True)[-1]
+    assert "frames: 1 ok, 7 lost\n" in printed.out
 
 
 def test_the_table_is_long_enough():

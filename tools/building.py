@@ -3,7 +3,7 @@
 RUN is a run folder or its recording. A building that is recorded (outputs=[trajectory,building]) is written as it is; else, or with --plugin, it is
 made from the frames, planes and poses of the recording. Metres; z up from the lowest floor, y (north on the plan) the direction of the building
 nearest to the first camera's view. model.ifc needs ifcopenshell: pip install 'trihedron[ifc]'. --pdf adds floorplan.pdf, at 1:50, 1:100 or 1:200
-on A4 or A3.
+on A4 or A3; one that is there is made again.
 
 Corrections are made in building.json: "deleted": true, another kind, a name, a use, an opening without an id. --edits building.json keeps them.
 
@@ -56,13 +56,14 @@ def main(argv: list[str]) -> int:
         name = path.resolve().parent.name if path.name == RECORDING else path.stem
         for line in write_building(out, building, name):
             print(line)
-        if options.pdf:
+        has_pdf = options.pdf or (out / PDF).exists()  # an older one would be of another plan than the files beside it
+        if has_pdf:
             write_pdf(out / PDF, building, name)
         if has_ifc():
             write_ifc(out / IFC, building)
     except OSError as error:
         raise DataError(str(error.filename or out), f"cannot be written: {error.strerror}", "give another --out FOLDER") from error
-    for file in (JSON, SVG, *((PDF,) if options.pdf else ()), DXF, GLB, *((IFC,) if has_ifc() else ())):
+    for file in (JSON, SVG, *((PDF,) if has_pdf else ()), DXF, GLB, *((IFC,) if has_ifc() else ())):
         print(f"  {out / file}")
     if not has_ifc():
         print(f"no {IFC}: {library_error('ifcopenshell')}")

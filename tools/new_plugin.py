@@ -18,6 +18,7 @@ from trihedron.pipeline.core.errors import DataError, UsageError, did_you_mean
 from trihedron.pipeline.core.files import write_file
 from trihedron.tools.arguments import Parser
 
+TEMPLATE_SENTENCE = "State in one sentence what the method computes (Author, venue, year)."  # no documentation for `trihedron check`
 WIDE = 6  # arguments that fit into one line
 PYPROJECT = """\
 [build-system]
@@ -51,7 +52,7 @@ from functools import cached_property
 @register("{slot}", "{name}")
 @dataclass(frozen=True)
 class {kind}:
-    """State in one sentence what the method computes (Author, venue, year).
+    """{sentence}
 
     Options are fields: a type with a range, a default, and a comment, for example
     `angle_deg: Annotated[float, Range(0, 90)] = 5.0  # between normals of one region`."""
@@ -183,7 +184,8 @@ def _module(slot: str, name: str, default: type[Any]) -> str:
     imports += "from trihedron.pipeline.core.registry import register\n"
     imports += f"from trihedron.pipeline.core.types import {', '.join(sorted(_types(used)))}\n"
     imports += f"from {default.__module__} import {renamed}\n"
-    return PLUGIN.format(slot=slot, name=name, kind=kind, imports=imports, default=default_name, methods=method)
+    words = {"slot": slot, "name": name, "kind": kind, "sentence": TEMPLATE_SENTENCE}
+    return PLUGIN.format(**words, imports=imports, default=default_name, methods=method)
 
 
 def _text(hint: Any) -> str:

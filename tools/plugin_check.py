@@ -41,6 +41,7 @@ from trihedron.pipeline.run.runner import Runner
 from trihedron.pipeline.run.scheduler import single_threaded_libraries
 from trihedron.tools.judged_calls import Call, Figure, figures_of_frames, worst
 from trihedron.tools.meanings import meanings_of
+from trihedron.tools.new_plugin import TEMPLATE_SENTENCE
 from trihedron.tools.plugins import first_sentence
 
 ROOM = ("dataset=synthetic", "dataset.width=320", "dataset.height=240", "dataset.length=8")
@@ -125,7 +126,7 @@ ADVERSE: dict[str, Callable[[Frame], Frame]] = {
     "nothing at all": lambda frame: replace(frame, color=np.zeros_like(frame.color), depth_m=np.zeros_like(frame.depth_m)),
     "noise": _noise,
     "one row of depth": _one_row,
-    "depth of kilometres": lambda frame: replace(frame, depth_m=frame.depth_m * np.float32(1000.0)),
+    "depth of hundreds of metres": lambda frame: replace(frame, depth_m=frame.depth_m * np.float32(100.0)),
 }
 REPEATED = "a frame that repeats"
 FEW: dict[str, dict[str, str]] = {  # scenes in which other stages find little: slot -> word
@@ -195,6 +196,8 @@ class PluginCheck:
         ]
         if not own or not re.match(r"[A-Z`'\"]", text) or text.startswith(CLAUSES):
             return Result("documented", False, "the class has no docstring that opens with what it does")
+        if text.partition("\n")[0] == TEMPLATE_SENTENCE:
+            return Result("documented", True, "the docstring is the template's; state what the method computes", judged=False)
         if silent:
             return Result("documented", False, f"neither a range nor a comment: {', '.join(silent)}")
         return Result("documented", True, f"{len(options_of(kind))} options")

@@ -52,7 +52,7 @@ def page(runs: Sequence[Run], title: str | None = None) -> str:
     return render(
         "report.html",
         title=title or title_of(facts),
-        origins=_table("Origins", "The commands as they were given.", ["run", "data set", "date", "command"], [*map(_origin, facts, facts.values())]),
+        origins=_table("Origins", _note(facts), ["run", "data set", "date", "command"], [*map(_origin, facts, facts.values())]),
         results=_table("Results", "± is half the distance from the smallest to the largest.", header, cells),
         sigmas=_sigmas({name: run.folder for name, run in named.items()}),
         configurations=changed_options(facts),
@@ -74,9 +74,18 @@ def _names(runs: Sequence[Run]) -> list[str]:
     return names if len(set(names)) == len(names) else ["/".join(run.folder.resolve().parts[-2:]) for run in runs]
 
 
+def _note(runs: Mapping[str, RunFacts]) -> str:
+    """The sentence above the commands."""
+    pushed = " pushed: the images came one by one from a Python program." * any(facts.is_pushed for facts in runs.values())
+    return f"The commands as they were given.{pushed}"
+
+
 def _origin(name: str, facts: RunFacts) -> tuple[str, ...]:
-    """Name, data set, date and command of a run."""
+    """Name, data set, date and command of a run; the options of one that a Python program made."""
     date = datetime.fromtimestamp((facts.run.folder / OVERRIDES).stat().st_mtime).astimezone().strftime("%Y-%m-%d %H:%M %Z")
+    if facts.is_pushed:
+        options = f"the options {shlex.join(facts.words)}" if facts.words else "no options"
+        return name, facts.data_set, date, f"none: frames were pushed from Python, into trihedron.Slam with {options}"
     return name, facts.data_set, date, shlex.join(["trihedron", "run", *facts.words])
 
 

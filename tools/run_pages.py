@@ -86,6 +86,11 @@ class RunFacts:
         return f"{self._dataset.get('plugin', '')} {self.folder_name}".strip() or "unknown"
 
     @property
+    def is_pushed(self) -> bool:
+        """Say if the frames came from a Python program, so that no command repeats the run."""
+        return self._dataset.get("plugin") == "pushed" and not any(word.startswith("replay=") for word in self.words)
+
+    @property
     def graph(self) -> str:
         """Return the graph of the run's words; the default where they name none."""
         return next((word.partition("=")[2] for word in self.words if word.startswith("graph=")), "structural")

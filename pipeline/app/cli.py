@@ -167,11 +167,15 @@ def _help(commands: dict[str, EntryPoint]) -> str:
 def _document(entry: EntryPoint) -> str:
     """The docstring of the command's module, read and not run: importing what all commands need takes half a second."""
     try:
-        spec = find_spec(entry.module)
+        return ast.get_docstring(ast.parse(_source(entry))) or ""
     except ImportError as error:
         return f"cannot be loaded: {error}"
-    source = spec.loader.get_source(entry.module) if spec and isinstance(spec.loader, InspectLoader) else None
-    return ast.get_docstring(ast.parse(source or "")) or ""
+
+
+def _source(entry: EntryPoint) -> str:
+    """The text of the command's module, empty where it has none. Raises ImportError."""
+    spec = find_spec(entry.module)
+    return (spec.loader.get_source(entry.module) if spec and isinstance(spec.loader, InspectLoader) else None) or ""
 
 
 def _run(words: list[str]) -> int:
@@ -179,10 +183,11 @@ def _run(words: list[str]) -> int:
     if "-h" in words or "--help" in words:
         print(run_help())
         return 0
+    for word, following in zip(words, [*words[1:], ""]):
+        if word.startswith("-") and word not in (*RUN_FLAGS, DRY_RUN[0]):
+            raise _unknown_flag(word, following)
     words = [given for word in words for given in _data_set(DRY_RUN[1] if word == DRY_RUN[0] else word)]
     for word in words:
-        if word.startswith("-") and word not in RUN_FLAGS:
-            raise UsageError(word, "is not an option of run", f"known: {', '.join((*RUN_FLAGS, DRY_RUN[0]))}; everything else is key=value")
         if word.startswith("=") or word == "out=":
             raise UsageError(word, "lacks a " + ("key" if word.startswith("=") else "folder"), "write key=value, for example out=runs/mine")
     with memory.gc_paused():
@@ -194,6 +199,28 @@ def _run(words: list[str]) -> int:
         return _sweep(words, _recorded_config(words))
     run_once(words, _BEGAN, keep=True)
     return 0
+
+
+def _unknown_flag(word: str, following: str) -> UsageError:
+    """Return the error of a word that is an option of no run: a key is written as key=value, and an option may be another command's."""
+    from trihedron.pipeline.core.config import is_key, is_switch
+
+    flag, equals, value = word.partition("=")
+    key = flag.lstrip("-")
+    if is_key(key):
+        if not equals:
+            value = "true" if is_switch(key) else following if following and "=" not in following and not following.startswith("-") else "VALUE"
+        return UsageError(flag, "is not an option of run", f"write {shlex.quote(f'{key}={value}')}")
+    if having := sorted(entry.name for entry in entry_points(group=COMMAND_GROUP) if _has_option(entry, flag)):
+        return UsageError(flag, "is not an option of run", f"it belongs to trihedron {' and '.join(having)}")
+    return UsageError(word, "is not an option of run", f"known: {', '.join((*RUN_FLAGS, DRY_RUN[0]))}; everything else is key=value")
+
+
+def _has_option(entry: EntryPoint, flag: str) -> bool:
+    """Say if a command has an option, by the text of its module."""
+    with suppress(ImportError):
+        return f'add_argument("{flag}"' in _source(entry)
+    return False
 
 
 def _in_current_names(words: list[str]) -> list[str]:

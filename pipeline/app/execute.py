@@ -10,10 +10,9 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from functools import cache, partial
 from pathlib import Path
-from shutil import rmtree
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
@@ -23,7 +22,7 @@ from trihedron.pipeline.app.compilation import compile_once
 from trihedron.pipeline.app.trajectory_plot import PLOT, trajectory_figure
 from trihedron.pipeline.app.viewers import Viewer, opened_viewer
 from trihedron.pipeline.core.config import Feedback, graph_of
-from trihedron.pipeline.core.errors import ConfigError, DataError, LibraryError, RecordingError, did_you_mean, printable
+from trihedron.pipeline.core.errors import ConfigError, DataError, LibraryError, RecordingError, StageError, did_you_mean, printable
 from trihedron.pipeline.core.files import sha256_of
 from trihedron.pipeline.core.graph import Graph
 from trihedron.pipeline.core.options import frame_range
@@ -41,7 +40,7 @@ from trihedron.pipeline.run.interrupts import defer_interrupts
 from trihedron.pipeline.run.live import Pace, shows_once
 from trihedron.pipeline.run.map_file import load_map, save_map
 from trihedron.pipeline.run.replay import TOPICS, Replay
-from trihedron.pipeline.run.run_folder import lock_folder, point_latest, write_configuration
+from trihedron.pipeline.run.run_folder import FolderBefore, lock_folder, point_latest, write_configuration
 from trihedron.pipeline.run.runner import Runner, Step
 from trihedron.pipeline.run.state import DelayLines, max_delays
 from trihedron.pipeline.run.stated_sigma import sigma_line
@@ -83,7 +82,8 @@ def _execute(config: DictConfig, out: Path, overrides: list[str], began: float, 
     topics = recorded_topics(config, graph, replay)
     _announce(runner)
     trial = partial(Runner, graph, config.seed, config.threads, replay, frames, remembered)
-    with _interruption_explained(runner, out), lock_folder(out):
+    before = FolderBefore.of(out / RECORDING)
+    with lock_folder(out), _removed_without_frames(runner, before):
         compile_once(runner.computed, runner.count if runner.feed is None else None)
         write_configuration(out, config, overrides)
         with Warnings() as warnings, compilation_reported():
@@ -125,23 +125,18 @@ def open_writer(
 
 
 @contextmanager
-def _interruption_explained(runner: Runner, out: Path) -> Iterator[None]:
-    """Say what a run leaves behind that is interrupted in this block. A folder that it made and that holds no frame is removed, and those above that
-    it made for it and that are empty."""
-    made = [folder for folder in (out, *out.parents) if not folder.exists()]
+def _removed_without_frames(runner: Runner, before: FolderBefore) -> Iterator[None]:
+    """Remove what the block adds to the run folder where it ends before a frame is done; a run that is interrupted says what it leaves behind. What a
+    stage failed on is kept, to repeat it."""
     try:
         yield
-    except KeyboardInterrupt as error:
-        if count := len(runner.result.stamps_ns):
-            error.add_note(f"frames done: {count}, kept in {out}")
-        elif made:
-            error.add_note(f"nothing was computed, and {out} is removed")
-            rmtree(out, ignore_errors=True)
-            with suppress(OSError):  # another run is in it
-                for folder in made[1:]:
-                    folder.rmdir()
-        else:
-            error.add_note(f"nothing was computed; {out} was there before and is kept")
+    except BaseException as error:
+        count, out = len(runner.result.stamps_ns), before.folder
+        if not count and not isinstance(error, StageError):
+            before.restore()
+        if isinstance(error, KeyboardInterrupt):
+            left = f"{out} is removed" if before.missing else f"{out} was there before and is kept"
+            error.add_note(f"frames done: {count}, kept in {out}" if count else f"nothing was computed{', and' if before.missing else ';'} {left}")
         raise
 
 

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import dataclasses
 import re
+import shlex
 import threading
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from enum import Enum
 from importlib.resources import files
-from typing import Any
+from typing import Any, get_type_hints
 
 from hydra import compose, initialize_config_module
 from hydra.core.config_store import ConfigStore
@@ -25,13 +26,15 @@ from omegaconf.errors import ValidationError
 from trihedron.pipeline.core.errors import ConfigError, TrihedronError, UsageError, did_you_mean
 from trihedron.pipeline.core.graph import Graph, build_graph
 from trihedron.pipeline.core.libraries import library_error
-from trihedron.pipeline.core.overrides import with_literal_paths
+from trihedron.pipeline.core.options import constraints_of
+from trihedron.pipeline.core.overrides import closing_brackets, with_literal_paths
 from trihedron.pipeline.core.plugin_configs import PLUGIN_KEY, offer_plugins, with_defaults
 from trihedron.pipeline.core.registry import cure_of_unknown, load_packages, load_plugins, options_of, plugin_class, plugins_of
 from trihedron.pipeline.core.slots import SLOTS, Localising, default_wires
 
 RECORDED_GRAPH = "recorded"  # in a replay: the option of `graph` with the wires of the recording
 SWEEPER, SEARCH, DASK = (f"hydra_plugins.trihedron.{name}" for name in ("Sweeper", "Search", "Dask"))  # `_target_` of Hydra's groups
+KINDS: dict[Any, str] = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}  # types of options, in words
 _COMPOSING = threading.Lock()  # Hydra has one state, and one ConfigStore, for the whole process
 
 
@@ -214,9 +217,23 @@ def make_plugin(slot: str, options: DictConfig) -> Any:
         raise ConfigError(place, cause, f"see trihedron plugins {slot} {name}") from error
 
 
+def is_key(name: str) -> bool:
+    """Say if a name begins as a key of a run does, as `out`, `planes` or `dataset.length`."""
+    return bool(re.fullmatch(r"\w+(\.\w+)*", name)) and name.partition(".")[0] in _root_keys()
+
+
+def is_switch(key: str) -> bool:
+    """Say if a root key is true or false."""
+    return get_type_hints(RunOptions).get(key) is bool
+
+
+def _root_keys() -> set[str]:
+    return {f.name for f in dataclasses.fields(RunOptions) if f.name != "defaults"} | set(SLOTS) | {"experiment", "without"}
+
+
 def check_added(overrides: Iterable[str]) -> None:
     """Hydra lets `+key=value` add any key, and nobody would read it. Raises UsageError for a key that no run has."""
-    known = {f.name for f in dataclasses.fields(RunOptions) if f.name != "defaults"} | set(SLOTS) | {"experiment", "without"}
+    known = _root_keys()
     for word in overrides:
         if (added := re.match(r"\+{1,2}([^=@]*)", word)) is not None and (root := re.split(r"[./]", added[1])[0]) not in known:
             cure = did_you_mean(root, known)
@@ -261,6 +278,9 @@ def rewrite_error(error: Exception) -> TrihedronError:
         return library_error(cause.name.partition(".")[0], cause)
     if match := re.search(r"Ambiguous value for argument '([^=']*)=([^']*)'", text):
         return UsageError(match[1], f"'{match[2]}' is several values", "add -m to run once with each, or write a list as [A,B]")
+    if isinstance(error, OverrideParseException) and (closing := closing_brackets(error.override)):
+        closed = shlex.quote(error.override.rstrip(", ") + closing)
+        return UsageError(error.override, f"lacks {closing} at its end", f"write {closed}")
     if isinstance(error, OverrideParseException):
         return UsageError(error.override, "is not an override", "write key=value, for example threads=1 (quote lists: 'only=[pose]')")
     if isinstance(error, MissingConfigException) and (match := re.search(r"Could not find '([\w/]+)/([^'/]*)'", text)):
@@ -270,12 +290,32 @@ def rewrite_error(error: Exception) -> TrihedronError:
     if isinstance(cause, ValidationError) and "is not a ListConfig" in str(cause):
         return ConfigError(str(getattr(cause, "full_key", "")), "is not a list", "write it as [A,B], quoted for the shell")
     if isinstance(cause, ValidationError):
-        place = getattr(cause, "full_key", None) or text.partition("=")[0].rpartition(" ")[2]
-        return ConfigError(str(place), " ".join(str(cause.msg or cause).split()).partition(" full_key")[0], "give a value of that type")
+        return _wrong_type(cause, text)
     if isinstance(error, OSError):
         return ConfigError("out", f"the folder cannot be made: {error.strerror}: {error.filename}", "give another out=FOLDER")
     place = str(getattr(cause, "full_key", "") or "configuration")
     return ConfigError(place, text.partition(" full_key")[0], "see trihedron run --help")
+
+
+def _wrong_type(error: ValidationError, text: str) -> ConfigError:
+    """Return the error of a value of another type than its option's: the kind, range and default of that."""
+    key = str(error.full_key or text.partition("=")[0].rpartition(" ")[2])
+    owner: Any = error.object_type
+    slot, constraints, cure = key.partition(".")[0], "", "see trihedron run --help"
+    if slot in SLOTS and isinstance(error.parent_node, DictConfig) and PLUGIN_KEY in error.parent_node:
+        owner = plugin_class(slot, name := str(error.parent_node[PLUGIN_KEY]))
+        constraints, cure = " and ".join(map(str, constraints_of(owner).get(str(error.key), ()))), f"see trihedron plugins {slot} {name}"
+    kind = get_type_hints(owner).get(str(error.key)) if dataclasses.is_dataclass(owner) else None
+    if isinstance(kind, type) and issubclass(kind, Enum):
+        permitted = "one of " + ", ".join(kind.__members__)
+    elif kind in KINDS:
+        permitted = KINDS[kind] + (f" that is {constraints}" if constraints else "")
+    else:
+        return ConfigError(key, " ".join(str(error.msg or error).split()).partition(" full_key")[0], "give a value of that type")
+    default = next(option.default for option in dataclasses.fields(owner) if option.name == error.key)
+    shown = default.name if isinstance(default, Enum) else str(default).lower() if isinstance(default, bool) else default
+    given = "null" if error.value is None else error.value
+    return ConfigError(key, f"'{given}' is not {permitted} (default {shown})", cure)
 
 
 def _unknown_option(group: str, name: str, options: list[str]) -> TrihedronError:

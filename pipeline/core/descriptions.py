@@ -202,11 +202,12 @@ def _(value: Surface) -> str:
 
 
 def summary_of_building(value: Building) -> str:
-    """Return the numbers of elements, the area and the note of a plan."""
-    counts = counted((len(value.storeys), "storey"), (len(value.areas_m2), "room"), (len(value.walls_m), "wall"), (len(value.spans_m), "opening"))
+    """Return the numbers of elements, the area of the rooms and the note of a plan."""
     sigma = float(np.sqrt(sum(area_sigma(value, room) ** 2 for room in range(len(value.areas_m2)))))
     area = f" of {value.areas_m2.sum():.2f} ± {sigma:.2f} m²" if len(value.areas_m2) else ""
-    return f"{counts}{area}" + (f"; {value.note}" if value.note else "")
+    rooms = counted((len(value.storeys), "storey"), (len(value.areas_m2), "room")) + area
+    counts = f"{rooms}, {counted((len(value.walls_m), 'wall'), (len(value.spans_m), 'opening'))}"
+    return counts + (f"; {value.note}" if value.note else "")
 
 
 @describe.register

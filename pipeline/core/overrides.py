@@ -16,6 +16,7 @@ PATH_KEYS = frozenset({
 LISTS = ("sequences", "alternatives")
 SYNONYMS = {"record.frames=foxglove": "record.frames=true"}  # frames are embedded in Foxglove's schemas
 PLAIN = re.compile(r"[\w./:+@%-]+", re.ASCII)  # a value that Hydra reads as it is written
+BRACKETS = {"[": "]", "(": ")", "{": "}"}
 SWEPT = re.compile(r".*,|(choice|glob|sort|shuffle)\(")
 
 
@@ -70,3 +71,16 @@ def list_elements(text: str) -> list[str]:
         elements.append(re.sub(r"\\([\\'\"])", r"\1", match["text"]) if "quote" in match.re.groupindex else match["text"].strip())
         rest = rest[match.end() :]
     return elements
+
+
+def closing_brackets(word: str) -> str:
+    """Return the closing brackets that an override lacks at its end, as `]` of `outputs=[pose`; what is between quotes has none."""
+    missing = ""
+    for bracket in re.findall(r"[][(){}]", re.sub(r"""(['"])(?:\\.|(?!\1).)*\1""", "", word)):
+        if bracket in BRACKETS:
+            missing = BRACKETS[bracket] + missing
+        elif not missing.startswith(bracket):
+            return ""
+        else:
+            missing = missing[1:]
+    return missing

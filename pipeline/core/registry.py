@@ -171,9 +171,11 @@ def _load_by_name(slot: str, name: str) -> None:
 
 
 def cure_of_unknown(slot: str, name: str) -> str:
-    """Return the cure for a plugin's name that is unknown: the closest names, and the packages of plugins that do not load, as it may be in one."""
+    """Return the cure for a plugin's name that is unknown: the closest method, else all, and the packages of plugins that do not load, as it may be
+    in one."""
     broken = [f"it may be in {package}, which does not load: {error}" for package, error in broken_packages().items()]
-    return "; ".join([did_you_mean(name, _PLUGINS[slot]), *broken])
+    close = did_you_mean(name, _PLUGINS[slot].keys() - {"none"})
+    return "; ".join([close if close.startswith("did") else f"known: {', '.join(sorted(_PLUGINS[slot]))}", *broken])
 
 
 def _register_in(known: dict[Key, Function], key: Key) -> Callable[[Function], Function]:

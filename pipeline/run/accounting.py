@@ -67,6 +67,8 @@ class Accounting:
         """Add the values of a frame to the result; False where the frame cannot be read. `late` frames do not count as unreadable.
 
         Raises DataError when too many of `count` frames cannot be read."""
+        if not values:  # the data set failed
+            return False
         times = self.times_at(position)
         for name, ms in times.calls_ms.items():
             self.timing.add_call(name, ms)

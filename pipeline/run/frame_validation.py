@@ -26,6 +26,7 @@ SATURATED, CROWDED = 0.02, 3.0  # a limit: share of the image that has this valu
 AWAY_S = 0.5  # to a frame that shows surfaces at other distances
 JUDGED = 10  # readable frames after which the scale of depth is judged
 SAMPLED_PX = 8  # apart are the readings by which scale and limit are judged
+FARTHEST_M = 1000.0  # beyond this no camera measures depth, and the covariance of a point is singular in double precision
 MILLIMETRES = 100.0  # metres, from which the median depth of a frame is one in millimetres
 OFF_CENTRE = 0.15  # of width or height: farther from the centre no camera has its principal point, unless images are cropped
 GAPS = 5  # between frames, whose median is judged, in periods of the camera
@@ -35,16 +36,21 @@ NEAR_M, FAR_M = 0.7, 8.0  # half of the readings nearer, or farther: no room of 
 
 
 def usable(frame: Frame) -> Frame | None:
-    """Return the frame with readings that are no distance (NaN, infinite, negative) as missing; None where camera and images differ in size."""
+    """Return the frame with readings that are no distance (NaN, infinite, negative, beyond `FARTHEST_M`) as missing; None where camera and images
+    differ in size."""
     camera, depth, (h, w) = frame.camera, frame.depth_m, frame.depth_m.shape
     if (camera.width, camera.height) != (w, h):
         log.warning("frame %d: its images are %d×%d while the camera is %d×%d; it is skipped", frame.index, w, h, camera.width, camera.height)
         return None
-    if depth.min(initial=0.0) >= 0.0 and depth.max(initial=0.0) < np.inf:  # NaN compares false
+    if depth.min(initial=0.0) >= 0.0 and depth.max(initial=0.0) <= FARTHEST_M:  # NaN compares false
         return frame
-    wrong = ~np.isfinite(depth) | (depth < 0.0)
-    log.warning("frame %d: %d depth readings are negative or not finite; they count as missing", frame.index, np.count_nonzero(wrong))
-    return replace(frame, depth_m=np.where(wrong, np.float32(0.0), depth))
+    faulty, far = ~np.isfinite(depth) | (depth < 0.0), np.isfinite(depth) & (depth > FARTHEST_M)
+    if faulty.any():
+        log.warning("frame %d: %d depth readings are negative or not finite; they count as missing", frame.index, np.count_nonzero(faulty))
+    if far.any():
+        cause = "frame %d: %d depth readings are beyond %.0f m and count as missing; is the depth_scale of the camera right?"
+        log.warning(cause, frame.index, np.count_nonzero(far), FARTHEST_M)
+    return replace(frame, depth_m=np.where(faulty | far, np.float32(0.0), depth))
 
 
 def judge_intrinsics(camera: Camera) -> None:

@@ -1,4 +1,4 @@
-"""The folder of a run: made, and held for this process before anything is written into it."""
+"""The folder of a run: made, held for this process before anything is written into it, and emptied again where no frame came."""
 
 from __future__ import annotations
 
@@ -6,7 +6,9 @@ import fcntl
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
+from shutil import rmtree
 
 import yaml
 from omegaconf import DictConfig, OmegaConf
@@ -16,6 +18,43 @@ from trihedron.pipeline.core.files import make_folder, write_file
 
 CONFIG = ".hydra"  # folder of the composed configuration and the words it was composed of
 CURE = "give another out=FOLDER"
+
+
+@dataclass(frozen=True)
+class FolderBefore:
+    """A run folder before the run writes: `missing` are it and those above it that do not exist, from the inside out, `present` is what it holds."""
+
+    folder: Path
+    missing: tuple[Path, ...]
+    present: frozenset[Path]
+    recording: Path
+    older: tuple[int, int] | None  # which file is there in its place
+
+    @classmethod
+    def of(cls, recording: Path) -> FolderBefore:
+        """Look at the folder of a recording, neither of which need exist."""
+        folder = recording.parent
+        missing = tuple(path for path in (folder, *folder.parents) if not path.exists())
+        return cls(folder, missing, frozenset(folder.iterdir() if folder.is_dir() else ()), recording, _identity(recording))
+
+    def restore(self) -> None:
+        """Remove what has been added, and a recording in the place of an older one."""
+        if self.missing:
+            rmtree(self.folder, ignore_errors=True)
+            with suppress(OSError):  # another run is in it
+                for path in self.missing[1:]:
+                    path.rmdir()
+            return
+        replaced = {self.recording} if _identity(self.recording) != self.older else set()
+        with suppress(OSError):
+            for path in {*self.folder.iterdir()} - self.present | replaced:
+                rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink(missing_ok=True)
+
+
+def _identity(path: Path) -> tuple[int, int] | None:
+    with suppress(OSError):
+        return (found := path.stat()).st_ino, found.st_ctime_ns
+    return None
 
 
 @contextmanager

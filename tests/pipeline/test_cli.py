@@ -43,7 +43,7 @@ def refused(capsys, *words, code=1):
 PATHS = "give a folder, a .mcap, .bag or .r3d file, or key=value (quote lists: 'only=[pose]')"
 SEE = "see trihedron plugins"
 MISTAKES = [
-    (["threads=abc"], 1, "trihedron: threads: Value 'abc' of type 'str' could not be converted to Integer; give a value of that type"),
+    (["threads=abc"], 1, "trihedron: threads: 'abc' is not a whole number (default 2); see trihedron run --help"),
     (["threads=0"], 1, "trihedron: threads: 0 is not a number of threads; give 1 to 256"),
     (["threds=1"], 1, "trihedron: threds: there is no such key; did you mean 'threads'?"),
     (["keypoints=orbs"], 1, "trihedron: keypoints: there is no plugin 'orbs' for the slot 'keypoints'; did you mean 'orb'?"),
@@ -75,7 +75,7 @@ MISTAKES = [
     (["only=[pose]"], 1, "trihedron: only: chooses stages of a replay, and there is none; give replay=FILE.mcap too"),
     (["replay=no.mcap"], 1, "trihedron: no.mcap: cannot be read: No such file or directory; give the path of an MCAP file"),
     (["record.topics=[normal]"], 1, "trihedron: record.topics: no stage writes 'normal'; did you mean 'normals'?"),
-    (["feedback=old"], 1, "trihedron: feedback: Invalid value 'old', expected one of [new, recorded]; give a value of that type"),
+    (["feedback=old"], 1, "trihedron: feedback: 'old' is not one of new, recorded (default new); see trihedron run --help"),
     (["out=/proc/no"], 1, "trihedron: out: the folder cannot be made: No such file or directory: /proc/no; give another out=FOLDER"),
     (["/no/pose"], 2, f"trihedron: /no/pose: is not key=value, and there is no such path; {PATHS}"),
     (["-x"], 2, "trihedron: -x: is not an option of run; known: -m, --multirun, --dry-run; everything else is key=value"),
@@ -280,7 +280,7 @@ def test_a_signal_leaves_a_recording_and_a_trajectory(tmp_path, number, code):
 @pytest.mark.parametrize("number, code", [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
 @pytest.mark.parametrize("is_new", [True, False])
 def test_a_signal_before_the_first_frame_leaves_no_empty_folder(tmp_path, capsys, monkeypatch, number, code, is_new):
-    """The signal comes while the recording is being opened. A folder that was there before is kept, with a recording that is closed."""
+    """The signal comes while the recording is being opened. A folder that was there before is kept as it was."""
     attach, out = RecordingWriter.attach, tmp_path / "early"
     if not is_new:
         out.mkdir()
@@ -299,7 +299,26 @@ def test_a_signal_before_the_first_frame_leaves_no_empty_folder(tmp_path, capsys
     assert capsys.readouterr().err.splitlines()[-1] == f"trihedron: interrupted; {left}"
     assert out.exists() != is_new
     if not is_new:
-        assert len(list(Recording(out / "run.mcap").values("pose"))) == 0
+        assert not list(out.iterdir())
+
+
+@pytest.mark.parametrize("mistake", ["library", "first image"])
+def test_a_data_set_that_cannot_be_opened_leaves_nothing(tmp_path, capsys, monkeypatch, mistake):
+    monkeypatch.setitem(sys.modules, "pyrealsense2", None)  # not installed
+    words, place = ["dataset=realsense"], "pyrealsense2: is not installed"
+    if mistake == "first image":
+        words, place = [str(tmp_path / "images")], "the data set is damaged"
+        for folder in ("rgb", "depth"):
+            (tmp_path / "images" / folder).mkdir(parents=True)
+            (tmp_path / "images" / folder / "0.png").write_text("no image")
+        (tmp_path / "images" / "camera.yaml").write_text("{width: 64, height: 48, fx: 50, fy: 50, cx: 31.5, cy: 23.5, depth_scale: 1000}")
+    (tmp_path / "old").mkdir()
+    (tmp_path / "old" / "notes.txt").write_text("mine")
+    before = sorted(tmp_path.rglob("*"))
+    for out in ("runs/walk", "old"):
+        assert main(["run", *words, f"out={out}"]) == 1
+        assert place in capsys.readouterr().err.splitlines()[-1]
+        assert sorted(tmp_path.rglob("*")) == before
 
 
 def test_a_signal_while_kernels_are_compiled_says_that_nothing_was_computed(tmp_path, capsys, monkeypatch):

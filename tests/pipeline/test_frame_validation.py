@@ -147,9 +147,20 @@ def test_a_camera_that_cannot_be_recorded_is_refused_at_the_first_frame():
 
 def test_millimetres_taken_for_metres_are_named_at_once(caplog):
     rng = np.random.default_rng(0)
-    warnings = validated([frame(k, rng.uniform(1499.6, 1500.4, (120, 160)).astype(np.float32)) for k in range(12)], caplog)[1]
+    given = [frame(k, rng.uniform(499.6, 500.4, (120, 160)).astype(np.float32)) for k in range(12)]
     cure = "give a depth_scale 1000 times as large, or divide float depth by 1000"
-    assert warnings == [f"the depth of frames is about 1500 m, which are millimetres taken for metres; {cure}"]
+    assert validated(given, caplog)[1] == [f"the depth of frames is about 500 m, which are millimetres taken for metres; {cure}"]
+
+
+def test_depth_of_kilometres_counts_as_missing(caplog):
+    depth = np.random.default_rng(0).uniform(900.0, 1000.0, (120, 160)).astype(np.float32)
+    depth[:2], depth[2, 0], depth[2, 1] = 16262.0, np.nan, 3e38
+    [found], warnings = validated([frame(0, depth)], caplog)
+    assert not found.depth_m[:2].any() and not found.depth_m[2, :2].any() and (found.depth_m[3:] == depth[3:]).all()
+    assert warnings[1:] == [
+        "frame 0: 1 depth readings are negative or not finite; they count as missing",
+        "frame 0: 321 depth readings are beyond 1000 m and count as missing; is the depth_scale of the camera right?",
+    ]
 
 
 @pytest.mark.parametrize(

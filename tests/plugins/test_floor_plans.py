@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import sys
 import zlib
@@ -206,7 +207,14 @@ def test_the_command_writes_the_pdf_where_it_is_asked_for(tmp_path, capsys):
     assert command.main([str(tmp_path / "walk"), "--out", str(tmp_path / "plan"), "--pdf"]) == 0
     assert f"  {tmp_path}/plan/floorplan.pdf\n" in capsys.readouterr().out
     th.Building(two_rooms()).to_pdf(tmp_path / "walk.pdf", name="walk")
-    assert (tmp_path / "plan" / "floorplan.pdf").read_bytes() == (tmp_path / "walk.pdf").read_bytes()
+    plan = tmp_path / "plan" / "floorplan.pdf"
+    assert plan.read_bytes() == (tmp_path / "walk.pdf").read_bytes()
+    found = json.loads((plan.parent / "building.json").read_text())
+    found["rooms"][0]["name"] = "Kitchen"
+    (tmp_path / "edited.json").write_text(json.dumps(found))
+    assert command.main([str(tmp_path / "walk"), "--out", str(plan.parent), "--edits", str(tmp_path / "edited.json")]) == 0
+    assert f"  {plan}\n" in capsys.readouterr().out  # made again, as it was there
+    assert plan.read_bytes() != (tmp_path / "walk.pdf").read_bytes()
 
 
 def test_the_dxf_has_the_usual_layers_walls_that_are_joined_and_dimensions(tmp_path):

@@ -23,6 +23,7 @@ from trihedron.plugins.normals.cross_product import CrossProduct
 from trihedron.plugins.planes.connected_components import ConnectedComponents
 from trihedron.plugins.pose.refine import Refine
 from trihedron.plugins.tracks.projection import Projection
+from trihedron.tools.new_plugin import TEMPLATE_SENTENCE
 from trihedron.tools.plugin_check import PluginCheck, room
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -145,12 +146,23 @@ class Undocumented(Good):
     more: float = 1.0
 
 
+@dataclass(frozen=True)
+class Template(Good):
+    __doc__ = TEMPLATE_SENTENCE
+
+
 def check(kind):
     return wrong(PluginCheck("normals", kind.__name__, given=kind()).results(quick=True))
 
 
 def test_a_good_plugin():
     assert check(Good) == {}
+
+
+def test_the_sentence_of_the_template_is_no_documentation():
+    assert PluginCheck("normals", "Good", given=Good()).static()[0].status == "ok"
+    found = PluginCheck("normals", "Template", given=Template()).static()[0]
+    assert (found.status, found.detail) == ("-", "the docstring is the template's; state what the method computes")
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ import html5lib
 import numpy as np
 import pytest
 
+import trihedron as th
 from trihedron.comparison.runs import Run
 from trihedron.pipeline.app.cli import main
 from trihedron.tools.run_configurations import changed_options
@@ -97,6 +98,18 @@ def test_a_page_names_data_set_runs_date_and_commands(page, tmp_path):
     )
     assert main(["report", str(page.parent / "0"), "--title", "Room & more", "--out", str(tmp_path / "other.html")]) == 0
     assert "<h1>Room &amp; more</h1>" in (tmp_path / "other.html").read_text()
+
+
+def test_a_page_of_pushed_frames_has_the_options_and_no_command(tmp_path):
+    room = th.dataset.synthetic(width=160, height=120, length=3)
+    with th.Slam(room(0).camera, "planes.angle_deg=4", outputs=["trajectory", "planes"], out=tmp_path / "walk") as slam:
+        for k in range(3):
+            slam.track(room(k).color, room(k).depth_m, room(k).stamp_ns / 1e9)
+    assert main(["report", str(tmp_path / "walk"), "--out", str(tmp_path / "page.html")]) == 0
+    text = html.unescape((tmp_path / "page.html").read_text())
+    assert "trihedron run" not in text and "pushed: the images came one by one from a Python program." in text
+    options = "planes.angle_deg=4 'outputs=[trajectory,planes]'"
+    assert f"none: frames were pushed from Python, into trihedron.Slam with the options {options}<" in text
 
 
 PLACES = """<script>addEventListener("load", () => setTimeout(() => {
