@@ -38,17 +38,19 @@ class FolderBefore:
         return cls(folder, missing, frozenset(folder.iterdir() if folder.is_dir() else ()), recording, _identity(recording))
 
     def restore(self) -> None:
-        """Remove what has been added, and a recording in the place of an older one."""
+        """Remove the folder where it was made, else the files and the configuration that were added: other folders may be another run's."""
         if self.missing:
             rmtree(self.folder, ignore_errors=True)
             with suppress(OSError):  # another run is in it
                 for path in self.missing[1:]:
                     path.rmdir()
             return
-        replaced = {self.recording} if _identity(self.recording) != self.older else set()
-        with suppress(OSError):
-            for path in {*self.folder.iterdir()} - self.present | replaced:
-                rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink(missing_ok=True)
+        added = {path for path in self.folder.iterdir() if path.is_file() and not path.is_symlink()} - self.present
+        for path in added | ({self.recording} if _identity(self.recording) != self.older else set()):
+            with suppress(OSError):
+                path.unlink(missing_ok=True)
+        if self.folder / CONFIG not in self.present:
+            rmtree(self.folder / CONFIG, ignore_errors=True)
 
 
 def _identity(path: Path) -> tuple[int, int] | None:
