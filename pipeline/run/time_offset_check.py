@@ -19,7 +19,7 @@ MIN_EDGES, SAMPLED_EDGES = 150, 200  # of a frame that is judged: pixels
 EVERY, MIN_FRAMES, MAX_FRAMES = 3, 16, 24  # judged: every third, so many at least and at most
 LONGEST_GAP_S = 0.3  # between two frames that a velocity is taken from
 MIN_MOTION_PX, AT_M = 3.0, 2.0  # motion of the image in a tenth of a second, at 640 a line, of what is so far away
-MIN_OFFSET_S, MIN_RATIO, MIN_T = 0.025, 1.08, 2.5  # of the best offset: of the scores with and without, and Student's t: see docs/decisions.md
+MIN_OFFSET_S, MIN_RATIO, MIN_T = 0.025, 1.2, 2.5  # of the best offset: of the scores with and without, and Student's t: see docs/decisions.md
 
 
 @dataclass

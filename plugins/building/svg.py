@@ -24,7 +24,7 @@ def floorplan_svg(building: Building, name: str = "") -> str:
     sheet = draw_plan(building, PX, name)
     width, height = (f"{value:.0f}" for value in sheet.size)
     space = 'xmlns="http://www.w3.org/2000/svg" text-anchor="middle"'
-    narrow = 'style="max-width:100%;height:auto"'  # on a narrow screen the whole plan, smaller
+    narrow = 'style="max-width:100%"'  # on a narrow screen the whole plan, smaller
     head = f'<svg {space} width="{width}" height="{height}" {narrow} viewBox="0 0 {width} {height}">'
     parts = [part for group in sheet.groups for part in _group(group)]
     return "\n".join([head, f"<style>{_style_sheet()}</style>", '<rect width="100%" height="100%" fill="#fff"/>', *parts, "</svg>", ""])

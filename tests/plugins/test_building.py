@@ -118,7 +118,7 @@ def test_the_files_hold_what_was_found_and_open_in_other_readers(offices, tmp_pa
 
     building = offices["manhattan_layout"]
     (line,) = write_building(tmp_path, building)
-    assert line == summary(building) and line.startswith("building: 1 storey, 3 rooms, ")
+    assert line == summary(building) and line.startswith("building: 1 storey, 3 rooms of 59.")
     read = json.loads((tmp_path / "building.json").read_text())
     assert read == building_json(building)
     assert [len(read[key]) for key in ("storeys", "walls", "rooms", "openings")] == [1, len(building.walls_m), 3, 2]
@@ -541,7 +541,7 @@ def test_a_room_seen_in_part_has_the_interval_of_its_area_on_its_plan(walk):
     building = folded("manhattan_layout", walk[1][:12])
     low, high = area_interval(building, 0)
     drawn = floorplan_svg(building)
-    assert f"{building.areas_m2[0]:.2f} m² seen" in drawn and f"({low:.1f} to {high:.1f})" in drawn and "±" not in drawn
+    assert f"{building.areas_m2[0]:.2f} m² seen" in drawn and f"({low:.1f} to {high:.1f})" in drawn and "m² ±" not in drawn
     assert low < building.areas_m2[0] < building.areas_m2[0] + 1.0 < high  # it may go on where nothing bounds what was seen
     assert 0.3 < seen_share(building, 0) < 0.9
     (room,) = building_json(building)["rooms"]
