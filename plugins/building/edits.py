@@ -8,12 +8,13 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import replace
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from trihedron.pipeline.core.errors import ConfigError, DataError
+from trihedron.pipeline.core.errors import ConfigError, DataError, printable
 from trihedron.pipeline.core.files import read_text, sha256_of
 from trihedron.pipeline.core.linalg import matmul, norm
 from trihedron.pipeline.core.types import ELEMENTS, OPENING_KINDS, Bool, Building
@@ -24,6 +25,8 @@ WITHOUT_IDS = "is no building.json with ids"
 MAX_BYTES = 16_000_000
 LEAST_OVERLAP = 0.5  # intersection by union of outlines
 NEAR_M = 0.25  # by which walls and openings, which are thin, are widened for that
+EDITED = {"wall": ("deleted", "name"), "room": ("deleted", "name", "use"), "opening": ("deleted", "name", "kind")}  # keys of corrections
+ALIKE = 0.75  # similarity of a mistyped key to its own
 DELETE = 'mark an element as "deleted": true instead of removing it'
 BESIDE_M = 0.3  # from a wall, of the rooms that an opening joins
 
@@ -67,6 +70,8 @@ class _FileEdits:
         known = {(edit.element, edit.number): edit for edit in self.carried}
         out = [edit for edit in self.carried if edit.number < 0]
         for element, items in self.lists.items():
+            for item in items:
+                _check_spelling(element, item)
             with_id = [item for item in items if "id" in item.item]
             for number, item in enumerate(with_id):
                 edit = self._edit(element, item, number, known.get((element, number)))
@@ -119,6 +124,13 @@ class _FileEdits:
         if len(ring) < 3:
             raise item.error("polygon", "is to have three corners or more")
         return Edit(element, wall.whole("storey", MOST), tuple((float(x), float(y)) for x, y in ring), **more)
+
+
+def _check_spelling(element: str, item: Checked) -> None:
+    """Raise DataError for a key that is nearly one of those that are read of a correction: it would be lost without a word."""
+    for key in item.item.keys() - set(EDITED[element]):
+        if close := get_close_matches(key.lower(), EDITED[element], 1, ALIKE):
+            raise DataError(item.place, f"has '{printable(key)}', which is not read", f"did you mean '{close[0]}'?")
 
 
 # Apply.

@@ -174,6 +174,8 @@ DELETE = 'mark an element as "deleted": true instead of removing it'
         (lambda found: found["walls"].pop(2), f": walls[2]: has not the id wall-2; {DELETE}"),
         (lambda found: found["openings"].pop(), f": has 0 openings with an id, and had 1; {DELETE}"),
         (lambda found: found["rooms"].append({}), ": rooms[2]: has no id; only openings can be added"),
+        (lambda found: found["rooms"][0].update(nme="Hall"), ": rooms[0]: has 'nme', which is not read; did you mean 'name'?"),
+        (lambda found: found["walls"][1].update(Delete=True), ": walls[1]: has 'Delete', which is not read; did you mean 'deleted'?"),
         (lambda found: found.pop("count"), ": is no building.json with ids; write it again with: trihedron building RUN"),
     ],
 )  # fmt: skip
