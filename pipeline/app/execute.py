@@ -126,8 +126,8 @@ def open_writer(
 
 @contextmanager
 def _removed_without_frames(runner: Runner, before: FolderBefore) -> Iterator[None]:
-    """Remove what the block adds to the run folder where it ends before a frame is done; a run that is interrupted says what it leaves behind. What a
-    stage failed on is kept, to repeat it."""
+    """Remove what the block adds to the run folder where it ends before a frame is done; the note of an interruption names what is left. What a stage
+    failed on is kept, to repeat it."""
     try:
         yield
     except BaseException as error:

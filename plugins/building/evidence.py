@@ -32,6 +32,16 @@ class Evidence:
     area_m2: F64
     rows: I32
 
+    @property
+    def eyes(self) -> F64:
+        """Return where the views were taken (v, 3)."""
+        return np.array([T[:3, 3] for T in self.poses])
+
+    @property
+    def upright(self) -> Bool:
+        """Say of each point (n,) if its region is upright."""
+        return np.asarray(np.abs(self.normals[:, 2]) < np.sin(np.radians(UPRIGHT_DEG)), np.bool_)
+
     def select(self, mask: Bool) -> Evidence:
         """Return the evidence of the points (n,) that the mask marks."""
         return replace(

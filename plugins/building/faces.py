@@ -11,7 +11,7 @@ import numpy as np
 
 from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import F64, I32, Bool
-from trihedron.plugins.building.evidence import UPRIGHT_DEG, Evidence
+from trihedron.plugins.building.evidence import Evidence
 from trihedron.plugins.building.free_space import CELL_M, LEVEL_M, FreeSpace
 from trihedron.plugins.building.free_space_kernels import LEVELS, U32
 from trihedron.plugins.building.levels import Storey, sliding_sum
@@ -19,6 +19,7 @@ from trihedron.plugins.shared.voxel_hash_kernels import I64
 
 TALL_M = 2.15  # above doors and most furniture
 BELOW_CEILING_M = 0.25
+CONE_DEG = 6.0  # between a region's normal and that of its face, at most
 SNAP_DEG = 3.0  # a direction nearer to an axis of the building is that axis
 BINS = 180  # of 1°
 PEAK = 3  # cm to both sides of a peak of the offsets
@@ -64,24 +65,24 @@ def tall_m(storey: Storey) -> float:
     return float(min(TALL_M, top - storey.bottom_m - BELOW_CEILING_M))
 
 
-def faces_of(evidence: Evidence, storey: Storey, space: FreeSpace, directions: F64, least_m: float) -> list[Face]:
-    """Find the faces with unit normals among `directions` (d, 2) that reach high over a stretch of at least that length."""
+def faces_of(upright: list[Face], storey: Storey, space: FreeSpace, least_m: float) -> list[Face]:
+    """Choose the faces, of `upright_faces`, that reach high over a stretch of at least that length."""
     found: list[Face] = []
-    for face in upright_faces(evidence, storey, directions):
+    for face in upright:
         face = replace(face, tall=close_gaps(_tall_columns(face, space, storey)))
         if longest_run(face.tall) * CELL_M >= least_m and not any(_hides(other, face) for other in found):
             found.append(face)
     return found
 
 
-def upright_faces(evidence: Evidence, storey: Storey, directions: F64, cone_deg: float = 6.0) -> list[Face]:
+def upright_faces(evidence: Evidence, storey: Storey, directions: F64) -> list[Face]:
     """Find the faces with unit normals among `directions` (d, 2), high and low; of each direction the strongest first."""
     found: list[Face] = []
     height = evidence.points[:, 2] - storey.bottom_m
     top = storey.ceiling_m - storey.bottom_m - 0.05 if np.isfinite(storey.ceiling_m) else LEVELS * LEVEL_M
-    upright = (np.abs(evidence.normals[:, 2]) < np.sin(np.radians(UPRIGHT_DEG))) & (height > 0.0) & (height < top)
+    upright = evidence.upright & (height > 0.0) & (height < top)
     for normal in directions:
-        facing = matmul(evidence.normals[:, :2], normal) > np.cos(np.radians(cone_deg))
+        facing = matmul(evidence.normals[:, :2], normal) > np.cos(np.radians(CONE_DEG))
         found += _faces_along(evidence, height, normal, np.nonzero(upright & facing)[0], storey)
     return found
 
@@ -166,7 +167,7 @@ def close_gaps(columns: Bool, gap: int = 2) -> Bool:
 
 def slanted_directions(evidence: Evidence, storey: Storey, apart_deg: float, least_m2: float) -> F64:
     """Return the directions (n,) of walls along neither axis, degrees: peaks with at least that area of tall points."""
-    tall = (np.abs(evidence.normals[:, 2]) < np.sin(np.radians(UPRIGHT_DEG))) & (evidence.points[:, 2] - storey.bottom_m > tall_m(storey))
+    tall = evidence.upright & (evidence.points[:, 2] - storey.bottom_m > tall_m(storey))
     angles = np.mod(np.degrees(np.arctan2(evidence.normals[tall, 1], evidence.normals[tall, 0])), 180.0)
     weight = evidence.area_m2[tall]
     histogram = np.bincount(angles.astype(int) % BINS, weight, BINS)

@@ -48,10 +48,12 @@ def plan_building(
     for number, storey in enumerate(storeys):
         here = in_storey(evidence, storeys, number)
         axes = directions(here, storey)
-        if mirrors := mirrors_of(upright_faces(here, storey, axes), upright_readings(here, storey), storey):
+        upright, readings = upright_faces(here, storey, axes), upright_readings(here, storey)
+        if mirrors := mirrors_of(upright, readings, storey):
             here = without_mirrors(here, mirrors)
+            upright, readings = upright_faces(here, storey, axes), upright_readings(here, storey)
         space = free_space(here, storey)
-        found = faces_of(here, storey, space, axes, min(SHORT_M, options.least_wall_m))
+        found = faces_of(upright, storey, space, min(SHORT_M, options.least_wall_m))
         faces, doubts = remove_furniture(found, here, storey, space, options.least_wall_m)
         faces += jog_sides(faces, here)
         cells = cells_of(faces, space)
@@ -59,7 +61,7 @@ def plan_building(
         for room in rooms:
             room.doubts = doubts_of(room, doubts, space)
         walls = walls_of(rooms, faces, here, storey, options.least_wall_m)
-        openings = openings_of(walls, rooms, faces, here, space, storey)
+        openings = openings_of(walls, rooms, faces, here, space, storey, readings)
         plans.append(StoreyPlan(storey, rooms, walls, openings, faces, remark(here, storey)))
     return assemble_building(state, evidence, plans, map)
 

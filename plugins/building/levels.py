@@ -8,7 +8,7 @@ import numpy as np
 
 from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import F64, Bool
-from trihedron.plugins.building.evidence import LEVEL_DEG, SCALE, UPRIGHT_DEG, Evidence, mean_over_views
+from trihedron.plugins.building.evidence import LEVEL_DEG, SCALE, Evidence, mean_over_views
 from trihedron.plugins.shared.voxel_hash_kernels import I64
 
 LEAST_FLOOR_M2 = 1.0
@@ -38,7 +38,7 @@ class Storey:
 def storeys_of(evidence: Evidence) -> list[Storey]:
     """Find the storeys from the lowest: floors at least STOREY_M apart that a camera stood above, each with the widest ceiling over it."""
     heights, areas = _level_peaks(evidence, 1.0)
-    eyes = np.array([T[2, 3] for T in evidence.poses])
+    eyes = evidence.eyes[:, 2]
     floors: list[float] = []
     for height, area in zip(heights, areas):
         below = ((eyes > height + EYE_M[0]) & (eyes < height + EYE_M[1])).any()
@@ -55,7 +55,7 @@ def storeys_of(evidence: Evidence) -> list[Storey]:
         low_mean, low_sigma = height_of(evidence, floor, 1.0) if np.isfinite(floor) else (float("nan"), float("nan"))
         high_mean, high_sigma = height_of(evidence, ceiling, -1.0) if np.isfinite(ceiling) else (float("nan"), float("nan"))
         low_sigma, high_sigma = float(np.hypot(low_sigma, SCALE * low_mean)), float(np.hypot(high_sigma, SCALE * high_mean))
-        heights = evidence.points[(evidence.points[:, 2] < high) & (np.abs(evidence.normals[:, 2]) < np.sin(np.radians(UPRIGHT_DEG))), 2]
+        heights = evidence.points[(evidence.points[:, 2] < high) & evidence.upright, 2]
         reach = float(np.percentile(heights, 98.0)) if len(heights) else float("inf")
         found.append(Storey(low_mean, high_mean, low_sigma, high_sigma, reach, high - SLAB_M))
     return found
@@ -73,7 +73,7 @@ def in_storey(evidence: Evidence, storeys: list[Storey], number: int) -> Evidenc
 def lowest_floor(evidence: Evidence) -> float:
     """Return the height of the lowest wide level below a camera that faces up, or of the lowest point less 1 % without one."""
     heights, areas = _level_peaks(evidence, 1.0)
-    eyes = np.array([T[2, 3] for T in evidence.poses])
+    eyes = evidence.eyes[:, 2]
     for height, area in zip(heights, areas):
         if area >= LEAST_FLOOR_M2 and ((eyes > height + EYE_M[0]) & (eyes < height + EYE_M[1])).any():
             return height_of(evidence, height, 1.0)[0]

@@ -8,20 +8,20 @@ import numpy as np
 
 from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import F64, I32, Bool
-from trihedron.plugins.building.evidence import UPRIGHT_DEG, Evidence
+from trihedron.plugins.building.evidence import Evidence
 from trihedron.plugins.building.faces import HIGH_M, Face, close_gaps, longest_run, runs_of
 from trihedron.plugins.building.free_space import CELL_M, LEVEL_M
 from trihedron.plugins.building.levels import Storey, sliding_sum
 from trihedron.plugins.shared.keyframe_views import KeyframeView
 from trihedron.plugins.shared.voxel_hash_kernels import I64
 
-EVERY = 4
+EVERY = 4  # of the readings, one is compared
 BEFORE_M, BEHIND_M = 0.3, 0.15  # of an eye and of its reading, for a ray that crosses a face
 FACING, ASIDE_WEIGHT = 0.7, 0.3  # of readings of surfaces that face a line, others' weight: a wall square to it may go on behind it
 SAME_M = 0.1  # side of the voxels in which readings are the same
 NEIGHBOURS = (0, 1 << 42, -(1 << 42), 1 << 22, -(1 << 22), 4, -4)  # steps of keys to voxels that share a side
 REACH = 3  # columns, of a face to the wall square to it that it reaches
-LEAST_FACING = 5
+LEAST_FACING = 5  # readings of surfaces that face a line, which decide alone
 BROAD, LEAST_WEIGHT = 3, 3.0  # of readings in so many neighbouring columns of a face
 LEAST_SHARE = 0.5  # of the readings through a mirror that repeat what is before it
 NARROWEST_M, RIM_M = 0.15, 0.05
@@ -76,11 +76,10 @@ class Crossing:
 
 def upright_readings(evidence: Evidence, storey: Storey) -> UprightReadings:
     """Select every EVERY-th reading of an upright surface."""
-    upright = (np.abs(evidence.normals[:, 2]) < np.sin(np.radians(UPRIGHT_DEG))) & (evidence.points[:, 2] > storey.bottom_m)
-    chosen = np.nonzero(upright)[0][::EVERY]
+    chosen = np.nonzero(evidence.upright & (evidence.points[:, 2] > storey.bottom_m))[0][::EVERY]
     points, normals = evidence.points[chosen], evidence.normals[chosen]
     keys, voxels = np.unique(_voxels(points, normals), return_inverse=True)
-    return UprightReadings(points, normals, evidence.rows[chosen], np.array([T[:3, 3] for T in evidence.poses]), keys, voxels.astype(np.int32))
+    return UprightReadings(points, normals, evidence.rows[chosen], evidence.eyes, keys, voxels.astype(np.int32))
 
 
 def mirrors_of(faces: list[Face], readings: UprightReadings, storey: Storey) -> list[Mirror]:
@@ -138,7 +137,7 @@ def _crossing(readings: UprightReadings, face: Face, span: tuple[float, float]) 
     rays = np.nonzero((away > BEFORE_M) & (off < -BEHIND_M))[0]
     place = eyes[readings.rows[rays]]
     place = place + (away[rays] / (away[rays] - off[rays]))[:, None] * (points[rays] - place)
-    along = place[:, 0] * normal[1] - place[:, 1] * normal[0]
+    along = matmul(place[:, :2], face.along)
     inside = (along > span[0]) & (along < span[1])
     rays, along, height = rays[inside], along[inside], place[inside, 2]
     facing, through = matmul(normals[rays, :2], normal), points[rays]
@@ -179,10 +178,10 @@ def _is_read(points: F64, normals: F64, readings: UprightReadings, chosen: Bool)
 def without_mirrors(evidence: Evidence, mirrors: list[Mirror]) -> Evidence:
     """Return the evidence with what mirrors show put where they are."""
     points, normals, views = evidence.points.copy(), evidence.normals.copy(), list(evidence.views)
-    eyes = np.array([T[:3, 3] for T in evidence.poses])
+    eyes = evidence.eyes[evidence.rows]
     for mirror in mirrors:
-        share, turned = mirror.crossing(eyes[evidence.rows], points)
-        points[turned] = eyes[evidence.rows[turned]] + share[turned, None] * (points[turned] - eyes[evidence.rows[turned]])
+        share, turned = mirror.crossing(eyes, points)
+        points[turned] = eyes[turned] + share[turned, None] * (points[turned] - eyes[turned])
         normals[turned] = [*mirror.normal, 0.0]
         for row in np.unique(evidence.rows[turned]):
             views[row] = _view_without(views[row], evidence.poses[row], mirror)

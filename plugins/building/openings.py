@@ -16,7 +16,7 @@ from trihedron.plugins.building.free_space import CELL_M, LEVEL_M, FreeSpace
 from trihedron.plugins.building.free_space_kernels import LEVELS, U32
 from trihedron.plugins.building.jogs import WIDEST_DOOR_M, is_recess
 from trihedron.plugins.building.levels import Storey, sliding_sum
-from trihedron.plugins.building.mirrors import UprightReadings, is_reflection, upright_readings
+from trihedron.plugins.building.mirrors import UprightReadings, is_reflection
 from trihedron.plugins.building.rooms import RoomPlan, room_at
 from trihedron.plugins.building.walls import AROUND_M, WallPlan
 
@@ -43,10 +43,11 @@ class OpeningPlan:
 
 
 def openings_of(
-    walls: list[WallPlan], rooms: list[RoomPlan], faces: list[Face], evidence: Evidence, space: FreeSpace, storey: Storey
+    walls: list[WallPlan], rooms: list[RoomPlan], faces: list[Face], evidence: Evidence, space: FreeSpace, storey: Storey, readings: UprightReadings
 ) -> list[OpeningPlan]:
-    """Find the stretches of each wall that rays cross from well before it to well behind it, at the same heights."""
-    found, readings = [], upright_readings(evidence, storey)
+    """Find the stretches of each wall that rays cross from well before it to well behind it, at the same heights, but those that
+    `readings` show to be mirrors."""
+    found = []
     for number, wall in enumerate(walls):
         levels = _crossing_levels(wall, space)
         crossed = np.array([bin(int(value)).count("1") >= 3 for value in levels], bool)

@@ -67,7 +67,7 @@ def _is_visited(polygon: Any, evidence: Evidence, space: FreeSpace) -> bool:
     """Say if a camera was in it, or some of its floor was seen."""
     import shapely
 
-    eyes = np.array([T[:2, 3] for T in evidence.poses])
+    eyes = evidence.eyes
     if shapely.contains_xy(polygon, eyes[:, 0], eyes[:, 1]).any():
         return True
     row, column = np.nonzero(space.floor)

@@ -4,11 +4,11 @@ Each scene is tracked with several seeds (of textures, path and noise) and the d
 aligns trajectory.txt with the truth, never by itself. A room is found where the intersection over union with a true one is above 0.5. Walls are the
 edges of found rooms that lie on a face that was seen, position the distance of their middle from the true edge. A doorway is found within 0.3 m of
 its middle. "honest" is the share of errors of areas, wall offsets and storey heights within 1.96 of their standard deviations. Figures are medians
-over the seeds, "honest" a mean. slanted_flat is laid out by atlanta_layout; the seed of random_flat and glazed_flat is the number of
-the flat, too. A second table
-has the measure of methods that are judged on Structured3D: rooms, corners and angles, and "area in 95 %", the share of rooms with an area in its
-interval; means over the runs with 95 % intervals (Student's t), and "false" the openings of all runs that are none. A benchmark with --out that was
-stopped goes on where it was. With --true-poses nothing is tracked: keyframes of the walk at their true poses show what the plan alone gets wrong.
+over the seeds, "honest" a mean. slanted_flat is laid out by atlanta_layout; the seed of random_flat and glazed_flat is the number of the flat, too. A
+second table has the measure of methods that are judged on Structured3D: rooms, corners and angles, and "area in 95 %", the share of rooms with an
+area in its interval; means over the runs with 95 % intervals (Student's t), and "false" the openings of all runs that are none. A benchmark with
+--out that was stopped goes on where it was. With --true-poses nothing is tracked: keyframes of the walk at their true poses show what the plan alone
+gets wrong.
 
 Example: trihedron benchmark building --scenes offices --seeds 2
 """
@@ -25,7 +25,7 @@ from pathlib import Path
 import numpy as np
 
 from trihedron.comparison.building_errors import plan_errors, plan_errors_of_run
-from trihedron.datasets.simulation.synthetic import Scene, Sensor, Synthetic
+from trihedron.datasets.simulation.synthetic import FLATS, Scene, Sensor, Synthetic
 from trihedron.pipeline.core.errors import UsageError, did_you_mean
 from trihedron.pipeline.core.files import write_file
 from trihedron.pipeline.core.registry import load_plugins, plugin_class
@@ -33,13 +33,11 @@ from trihedron.pipeline.core.text_table import table
 from trihedron.pipeline.core.types import Pose
 from trihedron.pipeline.sweep.paired_statistics import half_interval
 from trihedron.plugins.building.views import has_moved
-from trihedron.plugins.normals.integral_image import IntegralImage
-from trihedron.plugins.planes.connected_components import ConnectedComponents
 from trihedron.tools.arguments import Parser
 
 SCENES = ("offices", "rooms", "corridor", "flat", "slanted_flat", "house")
-FLATS = ("random_flat", "glazed_flat")
-MORE = (*FLATS, "whole_floor")  # on demand
+NUMBERED = tuple(scene.name for scene in FLATS)
+MORE = (*NUMBERED, "whole_floor")  # on demand
 LAYOUTS = {"slanted_flat": "atlanta_layout"}  # of the slot building; the other scenes have the graph's own
 SENSORS = ("kinect", "stereo")
 WIDTH, HEIGHT = 320, 240
@@ -49,19 +47,8 @@ HEADER = [
     "final s",
 ]  # fmt: skip
 PUBLISHED_HEADER = [
-    "scene",
-    "sensor",
-    "runs",
-    "room P",
-    "room R",
-    "room F1",
-    "corner P",
-    "corner R",
-    "corner F1",
-    "angle F1",
-    "area in 95 %",
-    "false",
-]
+    "scene", "sensor", "runs", "room P", "room R", "room F1", "corner P", "corner R", "corner F1", "angle F1", "area in 95 %", "false",
+]  # fmt: skip
 
 
 def main(argv: list[str]) -> int:
@@ -125,7 +112,7 @@ def _track_scene(scene: str, sensor: str, seed: int, fps: float, out: Path) -> P
         shutil.rmtree(unfinished, ignore_errors=True)
         words = ["dataset=synthetic", f"dataset.scene={scene}", f"dataset.sensor={sensor}", f"dataset.seed={seed}", f"dataset.width={WIDTH}"]
         words += [f"building={LAYOUTS[scene]}"] if scene in LAYOUTS else []
-        words += [f"dataset.flat={seed}"] if scene in FLATS else []
+        words += [f"dataset.flat={seed}"] if scene in NUMBERED else []
         measure([*words, f"dataset.height={HEIGHT}", f"dataset.fps={fps:g}", "outputs=[trajectory,building]", f"out={unfinished}"], unfinished)
         unfinished.rename(out)
     return out
@@ -134,26 +121,30 @@ def _track_scene(scene: str, sensor: str, seed: int, fps: float, out: Path) -> P
 def _figures(run: Path, plugin: str, anew: bool) -> dict[str, float]:
     """Return the figures of a run folder: of its plan as recorded, or made anew by a plugin or by its own."""
     stage = json.loads((run / "timing.json").read_text())["stages"]["building"]
-    own = LAYOUTS.get(run.name.split(".")[0], "manhattan_layout")
+    own = _layout_of(run.name.split(".")[0])
     figures = {"final_s": stage["finish_ms"] / 1e3} | plan_errors_of_run(run, plugin or (own if anew else None))
     return figures if plugin else figures | {"frame_ms": stage["p50_ms"]}
+
+
+def _layout_of(scene: str) -> str:
+    return LAYOUTS.get(scene, "manhattan_layout")
 
 
 def figures_at_true_poses(scene: str, sensor: str, seed: int, fps: float, plugin: str) -> dict[str, float]:
     """Return the figures of the plan of keyframes at their true poses, with the CPU time of its completion."""
     load_plugins()
     dataset = Synthetic(
-        scene=Scene[scene], sensor=Sensor[sensor], seed=seed, flat=seed if scene in FLATS else 0, fps=fps, width=WIDTH, height=HEIGHT
+        scene=Scene[scene], sensor=Sensor[sensor], seed=seed, flat=seed if scene in NUMBERED else 0, fps=fps, width=WIDTH, height=HEIGHT
     )  # fmt: skip
-    fold = plugin_class("building", plugin or LAYOUTS.get(scene, "manhattan_layout"))()
+    normals, planes = plugin_class("normals", "integral_image")(), plugin_class("planes", "connected_components")()
+    fold = plugin_class("building", plugin or _layout_of(scene))()
     state, last = fold.start(), None
     for index in range(len(dataset)):
         T = dataset.true_pose(index)
         if (last is None or has_moved(last, T)) and (frame := dataset(index)) is not None:
             last = T
-            planes = ConnectedComponents()(frame, IntegralImage()(frame))
             pose = Pose(index, frame.stamp_ns, T, SIGMA**2 * np.eye(6), T, -1, np.zeros(3, np.int32), 0, "ok", "")
-            state = fold.add(state, frame, planes, None, pose, None)
+            state = fold.add(state, frame, planes(frame, normals(frame)), None, pose, None)
     began = time.process_time()
     building = fold.finish(state, None)
     return {"final_s": time.process_time() - began} | plan_errors(building, np.eye(4), dataset.plans())
