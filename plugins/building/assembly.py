@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from trihedron.plugins.building.openings import OpeningPlan
 from trihedron.plugins.building.rooms import RoomPlan
 from trihedron.plugins.building.views import BuildingState
 from trihedron.plugins.building.walls import WallPlan
+from trihedron.plugins.shared.voxel_hash_kernels import I64
 
 AT_END = 4  # cells of an end of a wall, of which those at the wall that meets it there are seen with that
 
@@ -34,6 +36,16 @@ class StoreyPlan:
     remark: str = ""
 
 
+@dataclass(frozen=True)
+class MapPlanes:
+    """Planes of a map in the building's frame: ids (p,), normals (p, 3), offsets (p,) and samples (p, s, 3), NaN where there are fewer."""
+
+    ids: I64
+    normals: F64
+    offsets_m: F64
+    samples_m: F64
+
+
 def assemble_building(state: BuildingState, evidence: Evidence, plans: list[StoreyPlan], map: Map | None) -> Building:
     """Put the storeys' elements into one value."""
     support: list[tuple[int, int, int, int]] = []
@@ -47,9 +59,12 @@ def assemble_building(state: BuildingState, evidence: Evidence, plans: list[Stor
     heights, kinds, opening_walls, opening_covariance, opening_rooms = [], [], [], [], []
     doubts: list[tuple[int, float, float]] = []
     used: set[int] = set()
+    known = _map_planes(evidence, map)
     for level, plan in enumerate(plans):
+        planes_of = [_planes_of_wall(wall, known) for wall in plan.walls]
+        used.update(chain(*planes_of))
         first_wall, first_room = len(walls), len(areas)
-        support += _supports("storey", level, *_level_support(plan.storey, evidence, map), evidence)
+        support += _supports("storey", level, *_level_support(plan.storey, evidence, known), evidence)
         for number, wall in enumerate(plan.walls):
             edge = wall.edge
             foot = edge.offset_m * edge.normal
@@ -59,10 +74,8 @@ def assemble_building(state: BuildingState, evidence: Evidence, plans: list[Stor
             angle = edge.angle_sigma
             wall_covariance.append(np.diag([edge.sigma_m**2 + edge.drift_m2 + (SCALE * edge.offset_m) ** 2, wall.thickness_sigma_m**2, angle**2]))
             unseen += [(first_wall + number, a - wall.span[0], b - wall.span[0]) for a, b in _unseen_stretches(wall, plan.openings, number)]
-            planes = _planes_of_wall(wall, evidence, map)
-            used.update(planes)
             rows = np.unique(np.concatenate([e.views for _, e in wall.edges]))
-            support += _supports("wall", first_wall + number, planes, rows, evidence)
+            support += _supports("wall", first_wall + number, planes_of[number], rows, evidence)
         for number, room in enumerate(plan.rooms):
             rows = np.unique(np.concatenate([edge.views for loop in room.loops for edge in loop]))
             support += _supports("room", first_room + number, [], rows, evidence)
@@ -78,8 +91,7 @@ def assemble_building(state: BuildingState, evidence: Evidence, plans: list[Stor
             room_storeys.append(level)
             closed.append(all(edge.wall >= 0 for loop in room.loops for edge in loop))
         for opening in plan.openings:
-            planes = _planes_of_wall(plan.walls[opening.wall], evidence, map)
-            support += _supports("opening", len(spans), planes, opening.views, evidence)
+            support += _supports("opening", len(spans), planes_of[opening.wall], opening.views, evidence)
             start = plan.walls[opening.wall].span[0]
             spans.append([value - start for value in opening.span])
             heights.append(opening.heights)
@@ -97,7 +109,7 @@ def assemble_building(state: BuildingState, evidence: Evidence, plans: list[Stor
         np.array(edge_sigmas, np.float64),
         np.array(areas, np.float64), np.array(variances, np.float64), np.array(closed, np.bool_), np.array(opening_walls, np.int32),
         np.array(kinds, np.uint8), np.array(spans, np.float64).reshape(-1, 2), np.array(heights, np.float64).reshape(-1, 2),
-        np.array(opening_covariance).reshape(-1, 4, 4), np.array(opening_rooms, np.int32).reshape(-1, 2), _furniture(map, used, plans, evidence),
+        np.array(opening_covariance).reshape(-1, 4, 4), np.array(opening_rooms, np.int32).reshape(-1, 2), _furniture(known, used, plans),
         np.array(support, np.int32).reshape(-1, 4), np.array(doubts, np.float64).reshape(-1, 3),
     )  # fmt: skip
 
@@ -165,62 +177,50 @@ def _area(room: RoomPlan) -> tuple[float, float]:
     return area, variance
 
 
-def _planes_of_wall(wall: WallPlan, evidence: Evidence, map: Map | None) -> list[int]:
+def _planes_of_wall(wall: WallPlan, known: MapPlanes) -> list[int]:
     """Return the ids of the map's living planes that lie on either face of a wall."""
-    if map is None or len(map.planes) == 0:
-        return []
-    normals, _, points = _map_planes(evidence, map)
     edge, depth, found = wall.edge, wall.thickness_m, []
-    for row in np.nonzero(map.planes.rows("alive", np.arange(len(map.planes))))[0]:
-        seen = points[row][np.isfinite(points[row]).all(axis=1)]
+    facing = matmul(known.normals[:, :2], edge.normal)
+    for row in np.nonzero(np.abs(facing) > 0.995)[0]:
+        seen = known.samples_m[row][np.isfinite(known.samples_m[row]).all(axis=1)]
         if len(seen) == 0:
             continue
-        facing, off, t = (
-            float(matmul(normals[row, :2], edge.normal)),
-            matmul(seen[:, :2], edge.normal) - edge.offset_m,
-            matmul(seen[:, :2], edge.along),
-        )
+        off, t = matmul(seen[:, :2], edge.normal) - edge.offset_m, matmul(seen[:, :2], edge.along)
         between = ((t > wall.span[0] - 0.1) & (t < wall.span[1] + 0.1)).mean() > 0.5
-        near = np.abs(off).mean() < FIT_M if facing > 0.995 else facing < -0.995 and np.isfinite(depth) and np.abs(off + depth).mean() < FIT_M
+        near = np.abs(off).mean() < FIT_M if facing[row] > 0.0 else np.isfinite(depth) and np.abs(off + depth).mean() < FIT_M
         if between and near:
-            found.append(int(row))
+            found.append(int(known.ids[row]))
     return found
 
 
-def _level_support(storey: Storey, evidence: Evidence, map: Map | None) -> tuple[list[int], I32]:
+def _level_support(storey: Storey, evidence: Evidence, known: MapPlanes) -> tuple[list[int], I32]:
     """Return the ids of the map's living planes at a storey's floor or ceiling, and the views that show either."""
-    rows, planes, levels = np.zeros(0, np.int32), list[int](), ((storey.floor_m, 1.0), (storey.ceiling_m, -1.0))
-    for height, facing in levels:
+    rows, planes = np.zeros(0, np.int32), list[int]()
+    for height, facing in ((storey.floor_m, 1.0), (storey.ceiling_m, -1.0)):
         if np.isfinite(height):
             rows = np.union1d(rows, evidence.rows[at_level(evidence, height, facing)])
-    if map is not None and len(map.planes):
-        normals, offsets, _ = _map_planes(evidence, map)
-        alive = map.planes.rows("alive", np.arange(len(map.planes)))
-        for height, facing in levels:
-            near = alive & (normals[:, 2] * facing > np.cos(np.radians(LEVEL_DEG))) & (np.abs(offsets + height * normals[:, 2]) < LEVEL_NEAR_M)
-            planes += [int(row) for row in np.nonzero(near)[0]]
+        level = known.normals[:, 2] * facing > np.cos(np.radians(LEVEL_DEG))
+        planes += known.ids[level & (np.abs(known.offsets_m + height * known.normals[:, 2]) < LEVEL_NEAR_M)].tolist()
     return planes, rows.astype(np.int32)
 
 
-def _map_planes(evidence: Evidence, map: Map) -> tuple[F64, F64, F64]:
-    """Return normals (p, 3), offsets (p,) and samples (p, s, 3) of the map's planes in the building's frame."""
-    ids = np.arange(len(map.planes))
+def _map_planes(evidence: Evidence, map: Map | None) -> MapPlanes:
+    """Return the map's living planes in the building's frame."""
+    if map is None or len(map.planes) == 0:
+        return MapPlanes(np.empty(0, np.int64), np.empty((0, 3)), np.empty(0), np.empty((0, 0, 3)))
+    ids = np.nonzero(map.planes.rows("alive", np.arange(len(map.planes))))[0]
     R, t = evidence.T_world_building[:3, :3], evidence.T_world_building[:3, 3]
     coefficients = map.planes.rows("coefficients", ids)
     samples = np.asarray(map.planes.rows("samples_m", ids), np.float64)
-    return matmul(coefficients[:, :3], R), coefficients[:, 3] + matmul(coefficients[:, :3], t), matmul(samples - t, R)
+    return MapPlanes(ids, matmul(coefficients[:, :3], R), coefficients[:, 3] + matmul(coefficients[:, :3], t), matmul(samples - t, R))
 
 
-def _furniture(map: Map | None, used: set[int], plans: list[StoreyPlan], evidence: Evidence) -> I32:
+def _furniture(known: MapPlanes, used: set[int], plans: list[StoreyPlan]) -> I32:
     """Return the ids of the map's planes that are neither a wall's nor a floor nor a ceiling."""
-    if map is None or len(map.planes) == 0:
-        return np.empty(0, np.int32)
-    normals, offsets, _ = _map_planes(evidence, map)
-    alive = map.planes.rows("alive", np.arange(len(map.planes)))
     levels = [height for plan in plans for height in (plan.storey.floor_m, plan.storey.ceiling_m)]
     found = []
-    for row in np.nonzero(alive)[0]:
-        height = -offsets[row] / normals[row, 2] if abs(normals[row, 2]) > 0.9 else float("nan")
-        if row not in used and not any(abs(height - level) < 0.1 for level in levels):
-            found.append(int(row))
+    for number, normal, offset in zip(known.ids, known.normals, known.offsets_m):
+        height = -offset / normal[2] if abs(normal[2]) > 0.9 else float("nan")
+        if number not in used and not any(abs(height - level) < 0.1 for level in levels):
+            found.append(int(number))
     return np.array(found, np.int32)

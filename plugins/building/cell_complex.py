@@ -60,11 +60,11 @@ def cells_of(faces: list[Face], space: FreeSpace) -> Cells:
             if p != q:
                 sides[min(p, q), max(p, q)].append(number)
     edges = []
-    parting = [(face, parting_columns(face, faces)) for face in faces]
+    parting, normals = [(face, parting_columns(face, faces)) for face in faces], np.array([face.normal for face in faces]).reshape(-1, 2)
     for (p, q), pair in sides.items():
         if len(pair) == 2:
             a, b = np.array(p), np.array(q)
-            edges.append((pair[0], pair[1], _tall_share(parting, a, b), float(norm(b - a))))
+            edges.append((pair[0], pair[1], _tall_share(parting, normals, a, b), float(norm(b - a))))
     return Cells(polygons, free, edges)
 
 
@@ -91,18 +91,19 @@ def _steps(low: float, high: float) -> F64:
     return low + (np.arange(count) + 0.5) * (high - low) / count
 
 
-def _tall_share(parting: list[tuple[Face, Bool]], a: F64, b: F64) -> float:
+def _tall_share(parting: list[tuple[Face, Bool]], normals: F64, a: F64, b: F64) -> float:
     """Return the greatest share of a stretch that the parting columns of one face cover: one on its line, or the other face of the wall whose face is
-    on its line elsewhere."""
+    on its line elsewhere. `normals` (f, 2) are those of the faces."""
     direction, middle = (b - a) / max(float(norm(b - a)), 1e-9), (a + b) / 2.0
     across = np.array([-direction[1], direction[0]])
+    sides, where = matmul(normals, across), float(matmul(middle, across))
     faces = []  # the side they look to, where they are across the stretch, and the share
-    for face, columns in parting:
-        side = float(matmul(face.normal, across))
-        at = np.sign(side) * face.offset_m - float(matmul(middle, across))
-        if abs(side) > LEAST_COSINE and abs(at) < THICKEST_M:
+    for number in np.nonzero(np.abs(sides) > LEAST_COSINE)[0]:
+        (face, columns), side = parting[number], np.sign(sides[number])
+        at = side * face.offset_m - where
+        if abs(at) < THICKEST_M:
             t0, t1 = sorted((float(matmul(a, face.along)), float(matmul(b, face.along))))
-            faces.append((np.sign(side), at, face.share(t0, t1, columns)))
+            faces.append((side, at, face.share(t0, t1, columns)))
     best = max((share for _, at, share in faces if abs(at) < ON_LINE_M), default=0.0)
     for side in {side for side, at, _ in faces if abs(at) < ON_LINE_M}:
         behind = [(-side * at, share) for other, at, share in faces if other == -side and ON_LINE_M < -side * at < THICKEST_M]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -32,12 +33,12 @@ class Evidence:
     area_m2: F64
     rows: I32
 
-    @property
+    @cached_property
     def eyes(self) -> F64:
         """Return where the views were taken (v, 3)."""
         return np.array([T[:3, 3] for T in self.poses])
 
-    @property
+    @cached_property
     def upright(self) -> Bool:
         """Say of each point (n,) if its region is upright."""
         return np.asarray(np.abs(self.normals[:, 2]) < np.sin(np.radians(UPRIGHT_DEG)), np.bool_)

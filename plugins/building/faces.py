@@ -80,10 +80,11 @@ def upright_faces(evidence: Evidence, storey: Storey, directions: F64) -> list[F
     found: list[Face] = []
     height = evidence.points[:, 2] - storey.bottom_m
     top = storey.ceiling_m - storey.bottom_m - 0.05 if np.isfinite(storey.ceiling_m) else LEVELS * LEVEL_M
-    upright = evidence.upright & (height > 0.0) & (height < top)
+    upright = np.nonzero(evidence.upright & (height > 0.0) & (height < top))[0]
+    normals = evidence.normals[upright, :2]
     for normal in directions:
-        facing = matmul(evidence.normals[:, :2], normal) > np.cos(np.radians(CONE_DEG))
-        found += _faces_along(evidence, height, normal, np.nonzero(upright & facing)[0], storey)
+        facing = matmul(normals, normal) > np.cos(np.radians(CONE_DEG))
+        found += _faces_along(evidence, height, normal, upright[facing], storey)
     return found
 
 
@@ -96,17 +97,18 @@ def _faces_along(evidence: Evidence, height: F64, normal: F64, members: I64, sto
     along = matmul(evidence.points[members, :2], np.array([normal[1], -normal[0]]))
     levels = np.clip((height[members] / LEVEL_M).astype(int), 0, LEVELS - 1)
     weight = np.sqrt(evidence.information[members]) * evidence.area_m2[members]
-    low = float(offsets[high].min()) - 0.1
-    bins = np.bincount(((offsets[high] - low) / 0.01).astype(int), weight[high])
+    high_offsets, high_weight = offsets[high], weight[high]
+    low = float(high_offsets.min()) - 0.1
+    bins = np.bincount(((high_offsets - low) / 0.01).astype(int), high_weight)
     smooth = sliding_sum(np.concatenate([bins, np.zeros(10)]), np.array([0.25, 0.5, 0.75, 1.0, 0.75, 0.5, 0.25]))
     padded = np.concatenate([np.full(PEAK, -1.0), smooth, np.full(PEAK, -1.0)])
     peaks = [k for k in np.nonzero(smooth > 0.0)[0] if smooth[k] >= padded[k : k + 2 * PEAK + 1].max()]
     found: list[Face] = []
     for best in sorted(peaks, key=lambda k: -smooth[k]):
-        near = np.abs(offsets[high] - (low + (best + 0.5) * 0.01)) < 0.03
+        near = np.abs(high_offsets - (low + (best + 0.5) * 0.01)) < 0.03
         if not near.any():
             continue
-        offset = float(np.average(offsets[high][near], weights=weight[high][near]))
+        offset = float(np.average(high_offsets[near], weights=high_weight[near]))
         close = np.nonzero(np.abs(offsets - offset) < NEAR_FACE_M)[0]
         start = float(along[close].min())
         columns = ((along[close] - start) / CELL_M).astype(int)

@@ -21,6 +21,7 @@ def carve_kernel(
 
     A ray ends `margin[0] + margin[1] z²` before its reading; T is `T_building_camera`, `origin` the lower corner of cell (0, 0)."""
     h, w = once.shape
+    x0, y0, z0 = (T[0, 3] - origin[0]) / side_m, (T[1, 3] - origin[1]) / side_m, (T[2, 3] - floor_m) / level_m
     for r in range(step // 2, depth.shape[0], step):
         for c in range(step // 2, depth.shape[1], step):
             z = float(depth[r, c])
@@ -36,11 +37,11 @@ def carve_kernel(
             if free <= 0.0:
                 continue
             steps = int(np.ceil(free * max(flat / side_m, abs(dz) / level_m))) + 1
-            last = -1
+            last, pace = -1, free / steps
+            dx, dy, dz = dx * pace / side_m, dy * pace / side_m, dz * pace / level_m
             for k in range(steps):
-                t = free * (k + 0.5) / steps
-                column, row = int(np.floor((T[0, 3] + t * dx - origin[0]) / side_m)), int(np.floor((T[1, 3] + t * dy - origin[1]) / side_m))
-                level = int(np.floor((T[2, 3] + t * dz - floor_m) / level_m))
+                column, row = int(np.floor(x0 + (k + 0.5) * dx)), int(np.floor(y0 + (k + 0.5) * dy))
+                level = int(np.floor(z0 + (k + 0.5) * dz))
                 if level < 0 or level >= LEVELS or row < 0 or row >= h or column < 0 or column >= w:
                     continue
                 place = (row * w + column) * LEVELS + level

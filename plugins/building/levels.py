@@ -97,9 +97,10 @@ def _level_peaks(evidence: Evidence, facing: float) -> tuple[F64, F64]:
     level = evidence.normals[:, 2] * facing > np.cos(np.radians(LEVEL_DEG))
     if not level.any():
         return np.empty(0), np.empty(0)
-    places = np.unique(np.floor(evidence.points[level] / [0.1, 0.1, 0.02]).astype(np.int64), axis=0)
+    places = np.floor(evidence.points[level] / [0.1, 0.1, 0.02]).astype(np.int64)
     low = int(places[:, 2].min())
-    area = sliding_sum(np.bincount(places[:, 2] - low), np.ones(3)) * 0.01 / 2.0
+    keys = np.unique((places[:, 0] + (1 << 19) << 40) | (places[:, 1] + (1 << 19) << 20) | (places[:, 2] - low))
+    area = sliding_sum(np.bincount(keys & ((1 << 20) - 1)), np.ones(3)) * 0.01 / 2.0
     padded = np.concatenate([[-1.0] * 4, area, [-1.0] * 4])
     top = np.array([area[k] == padded[k : k + 9].max() and area[k] > 0.0 for k in range(len(area))], bool)
     heights = (np.nonzero(top)[0] + low + 0.5) * 0.02

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import F64, I32
 from trihedron.plugins.building.evidence import Evidence
 from trihedron.plugins.building.faces import Face
@@ -32,6 +33,7 @@ def looks_at(face: Face, evidence: Evidence, storey: Storey, inverses: list[F64]
     line = (face.start_m + (np.arange(columns) + 0.5) * CELL_M)[:, None] * face.along + face.offset_m * face.normal
     heights = np.asarray(storey.bottom_m + (np.arange(LEVELS) + 0.5) * LEVEL_M, np.float64)
     on, beyond = np.zeros((columns, LEVELS), np.int32), np.zeros((columns, LEVELS), np.int32)
-    for view, T in zip(evidence.views, inverses):
-        looks_kernel(view.depth_m, view.camera.intrinsics, T, line, face.normal, heights, NEAREST_M, MARGIN, on, beyond)
+    for row in np.nonzero(matmul(evidence.eyes[:, :2], face.normal) - face.offset_m >= NEAREST_M)[0]:
+        view, T = evidence.views[row], inverses[row]
+        looks_kernel(view.depth_m, view.camera.intrinsics, T, line, face.normal, heights, MARGIN, on, beyond)
     return Looks(on, beyond)

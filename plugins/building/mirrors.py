@@ -133,18 +133,19 @@ def _crossing(readings: UprightReadings, face: Face, span: tuple[float, float]) 
     evidence unless the face reaches it: it may go on behind."""
     points, normals, eyes, normal = readings.points, readings.normals, readings.eyes, face.normal
     off = matmul(points[:, :2], normal) - face.offset_m
-    away = (matmul(eyes[:, :2], normal) - face.offset_m)[readings.rows]
-    rays = np.nonzero((away > BEFORE_M) & (off < -BEHIND_M))[0]
-    place = eyes[readings.rows[rays]]
-    place = place + (away[rays] / (away[rays] - off[rays]))[:, None] * (points[rays] - place)
-    along = matmul(place[:, :2], face.along)
+    away = matmul(eyes[:, :2], normal) - face.offset_m
+    rays = np.nonzero((away > BEFORE_M)[readings.rows] & (off < -BEHIND_M))[0]
+    rows = readings.rows[rays]
+    share = away[rows] / (away[rows] - off[rays])
+    along = (1.0 - share) * matmul(eyes[:, :2], face.along)[rows] + share * matmul(points[rays, :2], face.along)
     inside = (along > span[0]) & (along < span[1])
-    rays, along, height = rays[inside], along[inside], place[inside, 2]
+    rays, rows, share, along = rays[inside], rows[inside], share[inside], along[inside]
+    height, before = (1.0 - share) * eyes[rows, 2] + share * points[rays, 2], away[readings.rows] > 0.0
     facing, through = matmul(normals[rays, :2], normal), points[rays]
     reflected, turned = through.copy(), normals[rays].copy()
     reflected[:, :2] -= 2.0 * off[rays, None] * normal
     turned[:, :2] -= 2.0 * facing[:, None] * normal
-    repeats = _is_read(reflected, turned, readings, (off > 0.0) & (away > 0.0)) & ~_is_read(through, normals[rays], readings, away < 0.0)
+    repeats = _is_read(reflected, turned, readings, before & (off > 0.0)) & ~_is_read(through, normals[rays], readings, ~before)
     column = np.floor((matmul(through[:, :2], face.along) - face.start_m) / CELL_M).astype(int)
     reached = sliding_sum(np.pad(face.count.any(axis=1), REACH).astype(np.float64), np.ones(2 * REACH + 1)) > 0.0
     met = reached[np.clip(column + REACH, 0, len(reached) - 1)]
@@ -178,10 +179,13 @@ def _is_read(points: F64, normals: F64, readings: UprightReadings, chosen: Bool)
 def without_mirrors(evidence: Evidence, mirrors: list[Mirror]) -> Evidence:
     """Return the evidence with what mirrors show put where they are."""
     points, normals, views = evidence.points.copy(), evidence.normals.copy(), list(evidence.views)
-    eyes = evidence.eyes[evidence.rows]
     for mirror in mirrors:
-        share, turned = mirror.crossing(eyes, points)
-        points[turned] = eyes[turned] + share[turned, None] * (points[turned] - eyes[turned])
+        behind = np.nonzero(matmul(points[:, :2], mirror.normal) < mirror.offset_m)[0]
+        rays = behind[(matmul(evidence.eyes[:, :2], mirror.normal) > mirror.offset_m)[evidence.rows[behind]]]
+        eyes = evidence.eyes[evidence.rows[rays]]
+        share, inside = mirror.crossing(eyes, points[rays])
+        turned = rays[inside]
+        points[turned] = eyes[inside] + share[inside, None] * (points[turned] - eyes[inside])
         normals[turned] = [*mirror.normal, 0.0]
         for row in np.unique(evidence.rows[turned]):
             views[row] = _view_without(views[row], evidence.poses[row], mirror)

@@ -17,7 +17,7 @@ from trihedron.plugins.building.levels import LEAST_FLOOR_M2, lowest_floor
 from trihedron.plugins.shared.keyframe_views import KeyframeView, view_of
 
 STRIDE = 2  # px of a view, between planar points
-MOVED_M, TURNED_DEG = 0.25, 15.0  # after which a frame without a map is kept
+MOVED_M, TURNED_DEG = 0.25, 15.0  # since the last view that was kept, after which another is
 PREVIEW_VIEWS = 60
 
 
@@ -56,7 +56,7 @@ def empty_state(options: LayoutOptions) -> BuildingState:
 def add_view(
     options: LayoutOptions, state: BuildingState, frame: Frame, planes: Planes, rotation: Rotation | None, pose: Pose, map: Map | None
 ) -> BuildingState:  # fmt: skip
-    """Retain the frame if it became a keyframe; without a map, if the camera has moved since the last. Other frames cost next to nothing."""
+    """Retain the frame if it became a keyframe, or without a map, and the camera has moved since the last. Other frames cost next to nothing."""
     state.index, state.stamp_ns, state.map = frame.index, frame.stamp_ns, map
     if rotation is not None and len(rotation.weights):
         state.axes = rotation.R_world_manhattan[int(np.argmax(rotation.weights))]
@@ -68,8 +68,8 @@ def add_view(
         newest, state.keyframes = len(map.keyframes), max(state.keyframes, len(map.keyframes))
         wanted = newest > 0 and int(map.keyframes.rows("index", np.array([newest - 1]))[0]) == frame.index
     else:
-        wanted = state.keyframes == 0 and (not state.views or has_moved(state.views[-1].T_world_camera, pose.T_world_camera))
-    if wanted:
+        wanted = state.keyframes == 0
+    if wanted and (not state.views or has_moved(state.views[-1].T_world_camera, pose.T_world_camera)):
         view = view_of(frame, planes, pose, map, options.view_width, options.max_sigma_m)
         state.views.append(replace(view, color=view.color[:0, :0].copy()))
         state.covariances.append(pose.covariance)
@@ -112,10 +112,10 @@ def gather_evidence(state: BuildingState, map: Map | None) -> Evidence | None:
     found = Evidence(T_world_building, [view for view, _ in views], poses, drift, points, normals, information, area, rows)
     level = lowest_floor(found)
     T_world_building[:3, 3] += R[:, 2] * level
-    found.points[:, 2] -= level
-    for T in found.poses:
+    points[:, 2] -= level
+    for T in poses:
         T[2, 3] -= level
-    return found
+    return replace(found)  # nothing that was computed of the evidence holds at this height
 
 
 def _regions(view: KeyframeView) -> tuple[F64, F64, F64, F64, F64]:

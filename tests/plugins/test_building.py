@@ -32,6 +32,8 @@ from trihedron.plugins.building.jogs import jog_sides, parting_columns
 from trihedron.plugins.building.openings import fit_jambs, widest_gap
 from trihedron.plugins.building.svg import floorplan_svg
 from trihedron.plugins.building.tall_furniture import Stretch, wall_probability
+from trihedron.plugins.mapping.insertion import add_keyframe
+from trihedron.plugins.mapping.landmarks import empty_map
 from trihedron.plugins.normals.integral_image import IntegralImage
 from trihedron.plugins.planes.connected_components import ConnectedComponents
 from trihedron.tools.benchmarks import building_benchmark
@@ -379,6 +381,19 @@ def test_a_preview_is_a_plan_of_some_views(walk, offices):
     preview = plugin.preview(state)
     assert len(state.views) == views > 60
     assert len(preview.areas_m2) == 3 and preview.areas_m2.sum() == pytest.approx(offices["manhattan_layout"].areas_m2.sum(), rel=0.05)
+
+
+def test_a_keyframe_is_kept_when_the_camera_has_moved(walk):
+    """Three keyframes at each of two places that are 30 cm apart, and a frame between that is none."""
+    plugin, (frame, planes, pose) = plugin_class("building", "manhattan_layout")(), walk[1][0]
+    state, map = plugin.start(), empty_map(0, 0, 32, 32, 16)
+    for index, (away_m, keyframe) in enumerate([(0.0, True)] * 3 + [(0.3, False)] + [(0.3, True)] * 3):
+        T = pose.T_world_camera.copy()
+        T[:3, 3] += away_m * T[:3, 2]
+        here = pose_at(index, T)
+        map = add_keyframe(map, here, frame.camera)[0] if keyframe else map
+        state = plugin.add(state, replace(frame, index=index), planes, None, here, map)
+    assert [view.index for view in state.views] == [0, 4]
 
 
 @pytest.mark.slow
