@@ -22,18 +22,19 @@ THIN_M = 0.38  # width of a cell that may be within a wall
 CAPACITY = 10_000  # of a square metre: capacities are whole numbers
 SLIVER_M = 0.005  # between lines that are one
 ON_LINE_M, LEAST_COSINE = 0.02, 0.9998  # of a stretch on the line of a face
+OPPOSITE_M = 0.6  # of the two faces of a wall
 TALL_SHARE = 0.5  # of an edge between cells, for which it parts them
 
 
 @dataclass(frozen=True)
 class Cells:
     """The cells of an arrangement: polygons, the share of each that is free, the edges (a, b, tall share, length) between neighbours, and which cells
-    (n,) are behind a face."""
+    (n,) may be within a wall: behind a face, or between the lines of both faces of one."""
 
     polygons: list[Any]
     free: F64
     edges: list[tuple[int, int, float, float]]
-    behind: Bool
+    in_wall: Bool
 
 
 def cells_of(faces: list[Face], space: FreeSpace) -> Cells:
@@ -60,7 +61,7 @@ def cells_of(faces: list[Face], space: FreeSpace) -> Cells:
         for p, q in pairwise(ring):
             if p != q:
                 sides[min(p, q), max(p, q)].append((number, 1.0 if p < q else -1.0))
-    edges, behind = [], np.zeros(len(polygons), np.bool_)
+    edges, in_wall = [], _are_between(polygons, faces)
     parting, normals = [(face, parting_columns(face, faces)) for face in faces], np.array([face.normal for face in faces]).reshape(-1, 2)
     for (p, q), pair in sides.items():
         if len(pair) == 2:
@@ -68,8 +69,30 @@ def cells_of(faces: list[Face], space: FreeSpace) -> Cells:
             along = _faces_along(parting, normals, a, b)
             edges.append((pair[0][0], pair[1][0], _tall_share(along), float(norm(b - a))))
             for number, left in pair:
-                behind[number] |= any(side == -left and abs(at) < ON_LINE_M and share >= TALL_SHARE for side, at, share in along)
-    return Cells(polygons, free, edges, behind)
+                in_wall[number] |= any(side == -left and abs(at) < ON_LINE_M and share >= TALL_SHARE for side, at, share in along)
+    return Cells(polygons, free, edges, in_wall)
+
+
+def _are_between(polygons: list[Any], faces: list[Face]) -> Bool:
+    """Say of each polygon (n,) if it is between the lines of the two faces of a wall, of which a stretch is seen from both sides."""
+    places = np.array([polygon.representative_point().coords[0] for polygon in polygons]).reshape(-1, 2)
+    between = np.zeros(len(places), np.bool_)
+    for face in faces:
+        across = matmul(places, face.normal)
+        for other in faces:
+            if _are_of_one_wall(face, other):
+                between |= (-other.offset_m < across) & (across < face.offset_m)
+    return between
+
+
+def _are_of_one_wall(face: Face, other: Face) -> bool:
+    """Say if two faces look away from each other, less than a wall's thickness apart, and a long stretch of both is opposite."""
+    if float(matmul(face.normal, other.normal)) > -0.999 or not 0.0 < face.offset_m + other.offset_m < THICKEST_M:
+        return False
+    places = -(face.start_m + (np.nonzero(face.tall)[0] + 0.5) * CELL_M)
+    columns = np.floor((places - other.start_m) / CELL_M).astype(int)
+    columns = columns[(columns >= 0) & (columns < len(other.tall))]
+    return float(other.tall[columns].sum()) * CELL_M >= OPPOSITE_M
 
 
 def _is_one_line(face: Face, other: Face) -> bool:
@@ -123,11 +146,11 @@ def _tall_share(faces: list[tuple[float, float, float]]) -> float:
 
 
 def inside_cells(cells: Cells) -> Bool:
-    """Return the cells (n,) that are inside: those that rays passed, and with them what was not seen and no wall parts from them. What is behind a
-    face and as thin as a wall is solid where no ray passed."""
+    """Return the cells (n,) that are inside: those that rays passed, and with them what was not seen and no wall parts from them. What may be
+    within a wall, and is as thin as one, is solid where no ray passed."""
     thin = np.array([polygon.buffer(-THIN_M / 2.0).is_empty for polygon in cells.polygons])
     wide = np.array([polygon.area > WIDE_M2 for polygon in cells.polygons])
-    return cut_cells(cells, OPEN_BORDER_M, np.where(thin & cells.behind | wide, 1.0, UNSEEN))
+    return cut_cells(cells, OPEN_BORDER_M, np.where(thin & cells.in_wall | wide, 1.0, UNSEEN))
 
 
 def cut_cells(cells: Cells, open_border_m: float, unseen: F64 | float) -> Bool:
