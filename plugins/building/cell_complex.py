@@ -147,23 +147,25 @@ def _tall_share(faces: list[tuple[float, float, float]]) -> float:
 
 def inside_cells(cells: Cells) -> Bool:
     """Return the cells (n,) that are inside: those that rays passed, and with them what was not seen and no wall parts from them. What may be
-    within a wall, and is as thin as one, is solid where no ray passed."""
+    within a wall, and is as thin as one, is solid where no ray passed, and has no open border there."""
     thin = np.array([polygon.buffer(-THIN_M / 2.0).is_empty for polygon in cells.polygons])
     wide = np.array([polygon.area > WIDE_M2 for polygon in cells.polygons])
-    return cut_cells(cells, OPEN_BORDER_M, np.where(thin & cells.in_wall | wide, 1.0, UNSEEN))
+    solid = thin & cells.in_wall
+    return cut_cells(cells, OPEN_BORDER_M * np.where(solid, cells.free, 1.0), np.where(solid | wide, 1.0, UNSEEN))
 
 
-def cut_cells(cells: Cells, open_border_m: float, unseen: F64 | float) -> Bool:
+def cut_cells(cells: Cells, open_border_m: F64 | float, unseen: F64 | float) -> Bool:
     """Label the cells (n,) inside or outside together, by a minimum cut source - cells - sink (Boykov, Jolly, ICCV 2001): a cell that is outside
     costs the area that rays passed, m²; one that is inside costs `unseen` times the area that they did not; a metre of border between both without a
-    wall costs `open_border_m`."""
+    wall costs `open_border_m`, the lesser of both cells'."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
     n = len(cells.polygons)
     area = np.array([polygon.area for polygon in cells.polygons])
     first, second, tall, length = np.array(cells.edges).reshape(-1, 4).T
-    numbers, border = np.arange(n), open_border_m * length * (1.0 - tall)
+    numbers, open_border = np.arange(n), np.broadcast_to(open_border_m, n)
+    border = np.minimum(open_border[first.astype(int)], open_border[second.astype(int)]) * length * (1.0 - tall)
     rows = np.concatenate([np.full(n, n), numbers, first, second]).astype(int)
     columns = np.concatenate([numbers, np.full(n, n + 1), second, first]).astype(int)
     capacity = np.concatenate([area * cells.free, unseen * area * (1.0 - cells.free), border, border])
