@@ -42,7 +42,7 @@ def jog_sides(faces: list[Face], evidence: Evidence, space: FreeSpace) -> list[F
                     behind = [other for other in faces if _stands_before(front, other, a, b)]
                 if behind:
                     side = _side(front, max(behind, key=lambda other: other.offset_m), a, b, at_end, evidence, space)
-                    if not any(_is_same(side, other) for other in (*faces, *found)):
+                    if len(side.tall) and not any(_is_same(side, other) for other in (*faces, *found)):
                         found.append(side)
     return found
 
@@ -125,18 +125,16 @@ def _side(front: Face, behind: Face, a: int, b: int, at_end: bool, evidence: Evi
     at = float(np.percentile(last, 99.0 if at_end else 1.0)) if len(last) else end if at_end else begin
     sign = 1.0 if at_end else -1.0
     normal = sign * front.along
-    corners = np.array([at * front.along + offset * front.normal for offset in (front.offset_m, behind.offset_m)])
-    along_side = np.array([normal[1], -normal[0]])
-    start, stop = np.sort(matmul(corners, along_side))
-    count = np.zeros((max(round(float(stop - start) / CELL_M), 1), LEVELS), np.int32)
+    away, depth = matmul(-front.normal, np.array([normal[1], -normal[0]])), front.offset_m - behind.offset_m
+    steps = np.asarray((np.arange(max(round(depth / CELL_M), 1)) + 0.5) * CELL_M, np.float64)  # from the front
+    start = away * -front.offset_m
+    line = Face(normal, sign * at, float(start), np.zeros((0, LEVELS), np.int32), np.zeros(0, np.bool_), np.empty(0, np.int64))
+    crossed = crossing_levels(line, start + away * steps, space).sum(axis=1) >= CROSSED
+    solid = int(np.argmax(crossed)) if crossed.any() else len(steps)
+    every = np.ones(solid, np.bool_)
+    count = np.zeros((solid, LEVELS), np.int32)
     count[:, 0] = 1
-    side = Face(normal, sign * at, float(start), count, np.ones(len(count), np.bool_), np.empty(0, np.int64))
-    places = np.asarray(start + (np.arange(len(count)) + 0.5) * CELL_M, np.float64)
-    crossed = crossing_levels(side, places, space).sum(axis=1) >= CROSSED
-    from_front = 1 if float(matmul(front.normal, along_side)) < 0.0 else -1
-    solid = np.asarray(np.cumsum(crossed[::from_front])[::from_front] == 0, np.bool_)
-    count[~solid] = 0
-    return replace(side, tall=solid, known=solid)
+    return replace(line, start_m=float(min(start, start + away * solid * CELL_M)), count=count, tall=every, known=every)
 
 
 def _is_same(side: Face, other: Face) -> bool:
