@@ -116,7 +116,7 @@ def wall_probability(one: Stretch, highest: float, prior: float) -> float:
 
 def _prior(face: Face, one: Stretch, faces: list[Face], depth: float | None) -> float:
     """Return the probability of a wall where its other face is close behind or it continues one, where a wall is seen behind, and elsewhere."""
-    if _is_backed(face, one, faces) or _continues(face, one):
+    if _is_backed(face, one, faces, depth) or _continues(face, one):
         return PRIORS["backed"]
     if depth is None:
         return PRIORS["alone"]
@@ -150,12 +150,12 @@ def _continues(face: Face, one: Stretch) -> bool:
     return bool(face.known[max(one.begin - aside, 0) : one.begin].any() or face.known[one.end : one.end + aside].any())
 
 
-def _is_backed(face: Face, one: Stretch, faces: list[Face]) -> bool:
-    """Say if another face looks away from a stretch, a wall's thickness behind it."""
+def _is_backed(face: Face, one: Stretch, faces: list[Face], depth: float | None = None) -> bool:
+    """Say if another face looks away from a stretch, a wall's thickness behind it; none that is behind the wall at that depth, whose it is."""
     begin, end = face.start_m + CELL_M * one.begin, face.start_m + CELL_M * one.end
     return any(
         float(matmul(other.normal, face.normal)) < -0.999
-        and 0.0 < face.offset_m + other.offset_m < THICKEST_M
+        and 0.0 < face.offset_m + other.offset_m < min(THICKEST_M, np.inf if depth is None else depth)
         and other.share(-end, -begin, other.tall) > 0.3
         for other in faces
     )
