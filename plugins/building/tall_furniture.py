@@ -99,8 +99,8 @@ def _stretches(face: Face, evidence: Evidence, storey: Storey, inverses: list[F6
     found = []
     for a, b in runs_of(face.tall):
         share = LEAST_SHARE if (b - a) * CELL_M >= LONG_M else 0.5
-        hangs = under[a:b].mean() > 0.5
-        found.append(Stretch(a, b, float(np.quantile(top[a:b], 1.0 - share)) * LEVEL_M, bool(over[a:b].mean() >= LEAST_SHARE), bool(hangs)))
+        height = (float(np.quantile(top[a:b], 1.0 - share)) - 0.5) * LEVEL_M  # the middle of a level
+        found.append(Stretch(a, b, height, bool(over[a:b].mean() >= LEAST_SHARE), bool(under[a:b].mean() > 0.5)))
     return found
 
 
