@@ -23,7 +23,7 @@ LEAST_LOOKS = 2
 LEAST_LEVELS = 4  # at which views look through below what is read: under a lintel, a beam, the edge of a slab
 LEAST_SHARE = 0.15  # of a stretch's columns, by which its height is judged, and from which it was looked over
 LONG_M = 0.4  # shorter stretches are judged by half of their columns
-PRIORS = {"backed": 0.95, "behind": 0.25, "narrow": 0.6, "alone": 0.75}  # probabilities of a wall before its height is known: `_prior`
+PRIORS = {"backed": 0.95, "behind": 0.25, "narrow": 0.6, "alone": 0.75}  # probabilities of a wall before its height is known: `wall_prior`
 MISTAKEN = 0.02  # how often a view is thought to look over a wall
 COLUMN_M = (0.3, 0.45)  # widths of columns; furniture as high as a man is seldom as narrow
 KNOWN = 0.8  # probability, without what is behind, from which a stretch is a wall by which others are judged
@@ -72,7 +72,7 @@ def remove_furniture(
         tall, counts = face.tall.copy(), False
         for one in found:
             depth = _depth_to_wall(face, one, faces)
-            probability = wall_probability(one, highest, _prior(face, one, faces, depth))
+            probability = wall_probability(one, highest, wall_prior(face, one, faces, depth))
             if depth is not None and depth < THIN_M and _wall_on_both_sides(face, one, depth, faces):
                 probability = 0.0
             deep = USUAL_DEPTH_M if depth is None else depth
@@ -114,7 +114,7 @@ def wall_probability(one: Stretch, highest: float, prior: float) -> float:
     return wall / (wall + furniture) if wall + furniture > 0.0 else 0.0
 
 
-def _prior(face: Face, one: Stretch, faces: list[Face], depth: float | None) -> float:
+def wall_prior(face: Face, one: Stretch, faces: list[Face], depth: float | None) -> float:
     """Return the probability of a wall where its other face is close behind or it continues one, where a wall is seen behind, and elsewhere."""
     if _is_backed(face, one, faces, depth) or _continues(face, one):
         return PRIORS["backed"]
