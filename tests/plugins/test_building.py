@@ -525,7 +525,7 @@ def test_rays_show_the_end_of_a_column_next_to_a_corner(nook_m):
 
 
 def test_a_side_ends_where_rays_cross_its_line():
-    """The seen side of a column as a front, whose end rays pass before the wall of the corner: its other side is the column's front, not one to the wall."""
+    """Of a column in front of a corner, one side is read: its front is square to that, and does not reach the wall of the corner."""
     side, corner = wall_face((1.0, 0.0), 0.35, [(-0.35, 0.0)]), wall_face((1.0, 0.0), -0.4, [(-2.0, 0.0)])
     space = passed_space(lambda x, y: (x > -0.4) & (y > np.where(x < 0.0, 0.0, 0.35)))
     (found,) = jog_sides([side, corner], NO_EVIDENCE, space)
