@@ -28,8 +28,8 @@ SAME_SIDE_M = 0.12  # from a face that was found
 
 
 def jog_sides(faces: list[Face], evidence: Evidence, space: FreeSpace) -> list[Face]:
-    """Return a face for each end of a tall stretch beyond which another face is read behind its line, or rays pass its line before such a face: square
-    to both, from one to the other."""
+    """Return a face for each end of a tall stretch beyond which another face is read behind its line, or rays cross that: square to both, from one to
+    the other."""
     found: list[Face] = []
     for front in faces:
         for a, b in runs_of(front.tall):
@@ -125,16 +125,15 @@ def _side(front: Face, behind: Face, a: int, b: int, at_end: bool, evidence: Evi
     at = float(np.percentile(last, 99.0 if at_end else 1.0)) if len(last) else end if at_end else begin
     sign = 1.0 if at_end else -1.0
     normal = sign * front.along
-    away, depth = matmul(-front.normal, np.array([normal[1], -normal[0]])), front.offset_m - behind.offset_m
-    steps = np.asarray((np.arange(max(round(depth / CELL_M), 1)) + 0.5) * CELL_M, np.float64)  # from the front
-    start = away * -front.offset_m
-    line = Face(normal, sign * at, float(start), np.zeros((0, LEVELS), np.int32), np.zeros(0, np.bool_), np.empty(0, np.int64))
-    crossed = crossing_levels(line, start + away * steps, space).sum(axis=1) >= CROSSED
-    solid = int(np.argmax(crossed)) if crossed.any() else len(steps)
-    every = np.ones(solid, np.bool_)
-    count = np.zeros((solid, LEVELS), np.int32)
+    line = Face(normal, sign * at, 0.0, np.zeros((0, LEVELS), np.int32), np.zeros(0, np.bool_), np.empty(0, np.int64))
+    away = -float(matmul(front.normal, line.along))  # 1 or -1: behind the front
+    steps = np.arange(max(round((front.offset_m - behind.offset_m) / CELL_M), 1)) + 0.5
+    crossed = crossing_levels(line, np.asarray(away * (CELL_M * steps - front.offset_m), np.float64), space).sum(axis=1) >= CROSSED
+    cells = int(np.argmax(crossed)) if crossed.any() else len(steps)
+    count, every = np.zeros((cells, LEVELS), np.int32), np.ones(cells, np.bool_)
     count[:, 0] = 1
-    return replace(line, start_m=float(min(start, start + away * solid * CELL_M)), count=count, tall=every, known=every)
+    start = min(-away * front.offset_m, away * (CELL_M * cells - front.offset_m))
+    return replace(line, start_m=start, count=count, tall=every, known=every)
 
 
 def _is_same(side: Face, other: Face) -> bool:
