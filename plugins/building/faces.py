@@ -133,12 +133,17 @@ def _tall_columns(face: Face, space: FreeSpace, storey: Storey) -> Bool:
     top = np.where(face.count.any(axis=1), LEVELS - 1 - np.argmax(face.count[:, ::-1] > 0, axis=1), -1)
     levels = np.arange(LEVELS)
     tall = face.count[:, levels * LEVEL_M > tall_m(storey)].sum(axis=1) >= LEAST_READINGS
-    line = (face.start_m + (np.arange(len(top)) + 0.5) * CELL_M)[:, None] * face.along + face.offset_m * face.normal
-    behind = space.at(line - ASIDE_M * face.normal)
-    crossed = behind & space.at(line) & space.at(line + ASIDE_M * face.normal)
-    passed, over = _bits(behind), _bits(crossed) & (levels > top[:, None] + 1)
+    places = np.asarray(face.start_m + (np.arange(len(top)) + 0.5) * CELL_M, np.float64)
+    passed = _bits(space.at(places[:, None] * face.along + (face.offset_m - ASIDE_M) * face.normal))
+    over = crossing_levels(face, places, space) & (levels > top[:, None] + 1)
     solid = (top * LEVEL_M >= HIGH_M) & (2 * passed.sum(axis=1) < (face.count > 0).sum(axis=1))
     return np.asarray((tall | solid) & (over.sum(axis=1) < CROSSED), np.bool_)
+
+
+def crossing_levels(face: Face, along: F64, space: FreeSpace) -> Bool:
+    """Return the levels (n, LEVELS) that rays passed before, on and behind the line of a face at places (n,) along it."""
+    line = along[:, None] * face.along + face.offset_m * face.normal
+    return _bits(space.at(line - ASIDE_M * face.normal) & space.at(line) & space.at(line + ASIDE_M * face.normal))
 
 
 def _bits(levels: U32) -> Bool:

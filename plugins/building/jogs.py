@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -9,13 +10,14 @@ import numpy as np
 from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import F64, Bool
 from trihedron.plugins.building.evidence import Evidence
-from trihedron.plugins.building.faces import Face, runs_of
-from trihedron.plugins.building.free_space import CELL_M
+from trihedron.plugins.building.faces import CROSSED, Face, crossing_levels, runs_of
+from trihedron.plugins.building.free_space import CELL_M, FreeSpace
 from trihedron.plugins.building.free_space_kernels import LEVELS
 from trihedron.plugins.shared.voxel_hash_kernels import I64
 
 DEPTH_M = (0.1, 1.0)  # of a jog
 BESIDE_M, HIDDEN_M = 0.25, 1.0  # stretch in which the face behind is read, and how far from the end of the face in front it may begin
+LEAST_PASSED = 2  # columns beyond an end that rays pass, for which the front ends there
 SHORT_M = 0.2  # least wall that meets the ceiling: the side of a niche, a column
 MOSTLY_BEHIND = 0.3  # of the levels at which the face behind is read, fewer than which the front is read beyond its end
 END_M = 0.25  # of a face, whose readings say where it ends
@@ -25,18 +27,22 @@ THICKEST_M = 0.3  # wall between two faces
 SAME_SIDE_M = 0.12  # from a face that was found
 
 
-def jog_sides(faces: list[Face], evidence: Evidence) -> list[Face]:
-    """Return a face for each end of a tall stretch beyond which another face is read behind its line: square to both, from one to the other."""
+def jog_sides(faces: list[Face], evidence: Evidence, space: FreeSpace) -> list[Face]:
+    """Return a face for each end of a tall stretch beyond which another face is read behind its line, or rays cross that: square to both, from one to
+    the other."""
     found: list[Face] = []
     for front in faces:
         for a, b in runs_of(front.tall):
             if (b - a) * CELL_M < SHORT_M:
                 continue
             for at_end in (False, True):
-                behind = [other for other in faces if _is_read_beyond(front, other, b if at_end else a, at_end)]
+                at = b if at_end else a
+                behind = [other for other in faces if _is_read_beyond(front, other, at, at_end)]
+                if not behind and _is_passed_beyond(front, at, at_end, space):
+                    behind = [other for other in faces if _stands_before(front, other, a, b)]
                 if behind:
-                    side = _side(front, max(behind, key=lambda other: other.offset_m), a, b, at_end, evidence)
-                    if not any(_is_same(side, other) for other in (*faces, *found)):
+                    side = _side(front, max(behind, key=lambda other: other.offset_m), a, b, at_end, evidence, space)
+                    if len(side.tall) and not any(_is_same(side, other) for other in (*faces, *found)):
                         found.append(side)
     return found
 
@@ -75,6 +81,23 @@ def _is_read_beyond(front: Face, other: Face, column: int, at_end: bool) -> bool
     return bool(first < hidden and ahead[: first + width].sum() < MOSTLY_BEHIND * there.sum() and (there > 0).mean() > 0.5)
 
 
+def _is_passed_beyond(front: Face, column: int, at_end: bool, space: FreeSpace) -> bool:
+    """Say if rays pass the line of a front next to an end of a stretch: it ends there."""
+    end, width = front.start_m + CELL_M * column, round(BESIDE_M / CELL_M)
+    beyond = end + CELL_M * (np.arange(width) + 0.5) * (1.0 if at_end else -1.0)
+    places = np.asarray(beyond, np.float64)
+    ahead, passed = levels_read(front, places), crossing_levels(front, places, space).sum(axis=1)
+    return bool(((passed >= CROSSED) & (ahead < MOSTLY_BEHIND * passed)).sum() >= LEAST_PASSED)
+
+
+def _stands_before(front: Face, other: Face, a: int, b: int) -> bool:
+    """Say if another face is that of the wall which a stretch stands before: it is read next to the stretch, on either side."""
+    if float(matmul(front.normal, other.normal)) < 0.999 or not DEPTH_M[0] < front.offset_m - other.offset_m < DEPTH_M[1]:
+        return False
+    begin, stop = front.start_m + CELL_M * a - HIDDEN_M, front.start_m + CELL_M * b + HIDDEN_M
+    return bool(other.tall[max(other.column_at(begin), 0) : max(other.column_at(stop), 0)].any())
+
+
 def is_recess(wall: Face, begin_m: float, end_m: float, faces: list[Face]) -> bool:
     """Say if a face is read close behind most of a stretch of a wall: what is open there is a niche."""
     places = np.asarray(np.arange(begin_m + CELL_M / 2.0, end_m, CELL_M), np.float64)
@@ -94,21 +117,23 @@ def levels_read(face: Face, along: F64) -> I64:
     return out
 
 
-def _side(front: Face, behind: Face, a: int, b: int, at_end: bool, evidence: Evidence) -> Face:
-    """Return the side from the end of the readings of a stretch to the face behind it."""
+def _side(front: Face, behind: Face, a: int, b: int, at_end: bool, evidence: Evidence, space: FreeSpace) -> Face:
+    """Return the side from the end of the readings of a stretch to the face behind it, as far as no rays cross it."""
     begin, end = front.start_m + CELL_M * a, front.start_m + CELL_M * b
     along = matmul(evidence.points[front.members, :2], front.along)
     last = along[(along > end - END_M) & (along < end + CELL_M)] if at_end else along[(along > begin - CELL_M) & (along < begin + END_M)]
     at = float(np.percentile(last, 99.0 if at_end else 1.0)) if len(last) else end if at_end else begin
     sign = 1.0 if at_end else -1.0
     normal = sign * front.along
-    corners = np.array([at * front.along + offset * front.normal for offset in (front.offset_m, behind.offset_m)])
-    along_side = np.array([normal[1], -normal[0]])
-    start, stop = np.sort(matmul(corners, along_side))
-    count = np.zeros((max(round(float(stop - start) / CELL_M), 1), LEVELS), np.int32)
+    line = Face(normal, sign * at, 0.0, np.zeros((0, LEVELS), np.int32), np.zeros(0, np.bool_), np.empty(0, np.int64))
+    away = -float(matmul(front.normal, line.along))  # 1 or -1: behind the front
+    steps = np.arange(max(round((front.offset_m - behind.offset_m) / CELL_M), 1)) + 0.5
+    crossed = crossing_levels(line, np.asarray(away * (CELL_M * steps - front.offset_m), np.float64), space).sum(axis=1) >= CROSSED
+    cells = int(np.argmax(crossed)) if crossed.any() else len(steps)
+    count, every = np.zeros((cells, LEVELS), np.int32), np.ones(cells, np.bool_)
     count[:, 0] = 1
-    every = np.ones(len(count), np.bool_)
-    return Face(normal, sign * at, float(start), count, every, np.empty(0, np.int64), every)
+    start = min(-away * front.offset_m, away * (CELL_M * cells - front.offset_m))
+    return replace(line, start_m=start, count=count, tall=every, known=every)
 
 
 def _is_same(side: Face, other: Face) -> bool:

@@ -55,7 +55,7 @@ def plan_building(
         space = free_space(here, storey)
         found = faces_of(upright, storey, space, min(SHORT_M, options.least_wall_m))
         faces, doubts = remove_furniture(found, here, storey, space, options.least_wall_m)
-        faces += jog_sides(faces, here)
+        faces += jog_sides(faces, here, space)
         cells = cells_of(faces, space)
         rooms = rooms_of(cells, inside(cells), faces, here, space, storey, options.least_room_m2)
         for room in rooms:

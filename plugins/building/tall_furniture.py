@@ -23,7 +23,7 @@ LEAST_LOOKS = 2
 LEAST_LEVELS = 4  # at which views look through below what is read: under a lintel, a beam, the edge of a slab
 LEAST_SHARE = 0.15  # of a stretch's columns, by which its height is judged, and from which it was looked over
 LONG_M = 0.4  # shorter stretches are judged by half of their columns
-PRIORS = {"backed": 0.95, "behind": 0.25, "narrow": 0.6, "alone": 0.75}  # probabilities of a wall before its height is known: `_prior`
+PRIORS = {"backed": 0.95, "behind": 0.25, "narrow": 0.6, "alone": 0.75}  # probabilities of a wall before its height is known: `wall_prior`
 MISTAKEN = 0.02  # how often a view is thought to look over a wall
 COLUMN_M = (0.3, 0.45)  # widths of columns; furniture as high as a man is seldom as narrow
 KNOWN = 0.8  # probability, without what is behind, from which a stretch is a wall by which others are judged
@@ -72,7 +72,7 @@ def remove_furniture(
         tall, counts = face.tall.copy(), False
         for one in found:
             depth = _depth_to_wall(face, one, faces)
-            probability = wall_probability(one, highest, _prior(face, one, faces, depth))
+            probability = wall_probability(one, highest, wall_prior(face, one, faces, depth))
             if depth is not None and depth < THIN_M and _wall_on_both_sides(face, one, depth, faces):
                 probability = 0.0
             deep = USUAL_DEPTH_M if depth is None else depth
@@ -99,8 +99,8 @@ def _stretches(face: Face, evidence: Evidence, storey: Storey, inverses: list[F6
     found = []
     for a, b in runs_of(face.tall):
         share = LEAST_SHARE if (b - a) * CELL_M >= LONG_M else 0.5
-        hangs = under[a:b].mean() > 0.5
-        found.append(Stretch(a, b, float(np.quantile(top[a:b], 1.0 - share)) * LEVEL_M, bool(over[a:b].mean() >= LEAST_SHARE), bool(hangs)))
+        height = (float(np.quantile(top[a:b], 1.0 - share)) - 0.5) * LEVEL_M  # the middle of a level
+        found.append(Stretch(a, b, height, bool(over[a:b].mean() >= LEAST_SHARE), bool(under[a:b].mean() > 0.5)))
     return found
 
 
@@ -114,9 +114,9 @@ def wall_probability(one: Stretch, highest: float, prior: float) -> float:
     return wall / (wall + furniture) if wall + furniture > 0.0 else 0.0
 
 
-def _prior(face: Face, one: Stretch, faces: list[Face], depth: float | None) -> float:
+def wall_prior(face: Face, one: Stretch, faces: list[Face], depth: float | None) -> float:
     """Return the probability of a wall where its other face is close behind or it continues one, where a wall is seen behind, and elsewhere."""
-    if _is_backed(face, one, faces) or _continues(face, one):
+    if _is_backed(face, one, faces, depth) or _continues(face, one):
         return PRIORS["backed"]
     if depth is None:
         return PRIORS["alone"]
@@ -150,12 +150,12 @@ def _continues(face: Face, one: Stretch) -> bool:
     return bool(face.known[max(one.begin - aside, 0) : one.begin].any() or face.known[one.end : one.end + aside].any())
 
 
-def _is_backed(face: Face, one: Stretch, faces: list[Face]) -> bool:
-    """Say if another face looks away from a stretch, a wall's thickness behind it."""
+def _is_backed(face: Face, one: Stretch, faces: list[Face], depth: float | None = None) -> bool:
+    """Say if another face looks away from a stretch, a wall's thickness behind it; none that is behind the wall at that depth, whose it is."""
     begin, end = face.start_m + CELL_M * one.begin, face.start_m + CELL_M * one.end
     return any(
         float(matmul(other.normal, face.normal)) < -0.999
-        and 0.0 < face.offset_m + other.offset_m < THICKEST_M
+        and 0.0 < face.offset_m + other.offset_m < min(THICKEST_M, np.inf if depth is None else depth)
         and other.share(-end, -begin, other.tall) > 0.3
         for other in faces
     )

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+import shapely
 
 import trihedron as th
 from trihedron.comparison.building_errors import plan_errors
@@ -31,7 +33,7 @@ from trihedron.plugins.building.ifc import has_ifc, write_ifc
 from trihedron.plugins.building.jogs import jog_sides, parting_columns
 from trihedron.plugins.building.openings import fit_jambs, widest_gap
 from trihedron.plugins.building.svg import floorplan_svg
-from trihedron.plugins.building.tall_furniture import Stretch, wall_probability
+from trihedron.plugins.building.tall_furniture import Stretch, wall_prior, wall_probability
 from trihedron.plugins.mapping.insertion import add_keyframe
 from trihedron.plugins.mapping.landmarks import empty_map
 from trihedron.plugins.normals.integral_image import IntegralImage
@@ -332,13 +334,13 @@ def test_below_a_low_ceiling_furniture_is_low():
 
 
 def test_what_no_view_shows_within_a_room_is_inside_and_within_a_wall_is_not():
-    import shapely
-
     polygons = [shapely.box(0, 0, 4, 1), shapely.box(0, 1, 1, 2), shapely.box(1, 1, 4, 2), shapely.box(0, 2, 4, 2.1), shapely.box(0, 2.1, 4, 4)]
     edges = [(0, 1, 0.0, 1.0), (0, 2, 0.0, 3.0), (1, 2, 0.0, 1.0), (1, 3, 0.0, 1.0), (2, 3, 1.0, 3.0), (3, 4, 1.0, 4.0)]
-    cells = Cells(polygons, np.array([1.0, 0.1, 1.0, 0.1, 1.0]), edges)
-    assert inside_cells(cells).tolist() == [True, True, True, False, True]
-    unseen = Cells([*polygons, shapely.box(4, 0, 7, 2)], np.array([1.0, 0.1, 1.0, 0.1, 1.0, 0.2]), [*edges, (0, 5, 0.0, 1.0), (2, 5, 0.0, 1.0)])
+    free, in_wall = np.array([1.0, 0.1, 1.0, 0.1, 1.0]), np.array([False, False, False, True, False])
+    assert inside_cells(Cells(polygons, free, edges, in_wall)).tolist() == [True, True, True, False, True]
+    assert inside_cells(Cells(polygons, free, edges, np.zeros(5, np.bool_))).tolist() == [True, True, True, True, True]
+    more = [*edges, (0, 5, 0.0, 1.0), (2, 5, 0.0, 1.0)]
+    unseen = Cells([*polygons, shapely.box(4, 0, 7, 2)], np.append(free, 0.2), more, np.append(in_wall, False))
     assert not inside_cells(unseen)[5]  # nobody overlooks 6 m² of a room
 
 
@@ -472,6 +474,16 @@ def test_a_wall_ends_with_its_readings_where_nothing_bounds_the_room():
     assert len(end_at_readings(ring, [face, behind])) == 4  # the wall there was seen from behind
 
 
+NO_EVIDENCE = Evidence(np.eye(4), [], [], np.empty((0, 3, 3)), np.empty((0, 3)), np.empty((0, 3)), np.empty(0), np.empty(0), np.empty(0, np.int32))
+
+
+def passed_space(where: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> FreeSpace:
+    """Free space of 4 m by 4 m about the origin, of which rays passed what the condition on x and y says."""
+    x, y = np.meshgrid(np.arange(-1.975, 2.0, 0.05), np.arange(-1.975, 2.0, 0.05))
+    passed = where(x, y)
+    return FreeSpace(np.full(2, -2.0), np.where(passed, 0xFFFFF, 0).astype(np.uint32), passed, np.zeros(passed.shape, np.bool_))
+
+
 def column_and_wall(hidden: int) -> tuple[Face, Face]:
     """The front of a column of 0.35 m before a wall, of which that many cells beside the column's end were not read."""
     none = np.empty(0, np.int64)
@@ -484,12 +496,48 @@ def column_and_wall(hidden: int) -> tuple[Face, Face]:
 @pytest.mark.parametrize(("hidden", "sides"), [(0, [1, -1]), (12, [1, -1]), (30, [-1])])
 def test_the_side_of_a_column_may_hide_some_of_the_wall_beside_it(hidden, sides):
     """The side is where the readings of the front end, if the wall behind is read at most a metre on."""
-    nothing = Evidence(np.eye(4), [], [], np.empty((0, 3, 3)), np.empty((0, 3)), np.empty((0, 3)), np.empty(0), np.empty(0), np.empty(0, np.int32))
-    found = jog_sides(list(column_and_wall(hidden)), nothing)
+    found = jog_sides(list(column_and_wall(hidden)), NO_EVIDENCE, passed_space(lambda x, y: x < -9.0))
     assert sorted((int(side.normal[0]), round(side.offset_m, 6)) for side in found) == sorted((sign, 0.35 if sign > 0 else 0.0) for sign in sides)
     for side in found:  # from the front to the wall
         ends = side.start_m, side.start_m + 0.05 * len(side.count)
         assert sorted(abs(end) for end in ends) == pytest.approx([0.0, 0.35], abs=0.03)
+
+
+@pytest.mark.parametrize("nook_m", [0.2, 0.4])
+def test_rays_show_the_end_of_a_column_next_to_a_corner(nook_m):
+    """Of the nook between the column and the corner nothing is read but the wall beside it; rays pass its mouth, not its ground."""
+    front, wall = column_and_wall(20)
+    wall = replace(wall, start_m=0.5, count=np.ones((30, LEVELS), np.int32), tall=np.ones(30, np.bool_))
+    corner = wall_face((1.0, 0.0), -nook_m, [(-2.0, -0.1)])
+
+    def passed(x, y, mouth_m=0.2):
+        return (x > -nook_m) & (y > np.where(x < 0.0, 0.35 - mouth_m, np.where(x < 0.35, 0.35, 0.0)))
+
+    space = passed_space(passed)
+    faces = [front, wall, corner]
+    assert [int(side.normal[0]) for side in jog_sides(faces, NO_EVIDENCE, passed_space(lambda x, y: passed(x, y, 0.0)))] == [1]
+    sides = sorted(jog_sides(faces, NO_EVIDENCE, space), key=lambda side: side.normal[0])
+    assert [int(side.normal[0]) for side in sides] == [-1, 1] and all(len(side.tall) == 7 for side in sides)
+    cells = cells_of([*faces, *sides], space)
+    inside = [polygon for polygon, kept in zip(cells.polygons, inside_cells(cells)) if kept]
+    covered = [any(shapely.contains_xy(polygon, *place) for polygon in inside) for place in ((-0.1, 0.02), (0.2, 0.2), (0.2, 0.5), (0.6, 0.1))]
+    assert covered == [True, False, True, True]  # nook, column, before it, beside it
+
+
+def test_a_side_ends_where_rays_cross_its_line():
+    """Of a column in front of a corner, one side is read: its front is square to that, and does not reach the wall of the corner."""
+    side, corner = wall_face((1.0, 0.0), 0.35, [(-0.35, 0.0)]), wall_face((1.0, 0.0), -0.4, [(-2.0, 0.0)])
+    space = passed_space(lambda x, y: (x > -0.4) & (y > np.where(x < 0.0, 0.0, 0.35)))
+    (found,) = jog_sides([side, corner], NO_EVIDENCE, space)
+    assert found.normal == pytest.approx([0.0, 1.0]) and found.offset_m == pytest.approx(0.35)
+    assert found.start_m == pytest.approx(-0.1, abs=0.11) and found.start_m + 0.05 * len(found.tall) == pytest.approx(0.35)
+
+
+def test_the_other_face_of_a_wall_is_not_that_of_a_curtain_before_it():
+    """A curtain of 2.1 m, 13 cm before a wall that is seen beside it, and from the other room."""
+    curtain, one = wall_face((0.0, 1.0), 0.13, [(0.0, 1.5)]), Stretch(0, 30, 2.1, False)
+    wall, other = wall_face((0.0, 1.0), 0.0, [(1.5, 4.0)]), wall_face((0.0, -1.0), 0.1, [(-4.0, 0.0)])
+    assert wall_prior(curtain, one, [curtain, wall, other], 0.13) < 0.5 < wall_prior(curtain, one, [curtain, other], None)
 
 
 def wall_face(normal: tuple[float, float], offset_m: float, runs: list[tuple[float, float]]) -> Face:
