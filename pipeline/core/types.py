@@ -44,6 +44,7 @@ __all__ = [
     "Column",
     "Correction",
     "DepthNoise",
+    "Effort",
     "Frame",
     "FrameReference",
     "Keypoints",
@@ -90,6 +91,13 @@ class FrameReference(Value):
     """A stand-in for a frame in a recording that does not embed it (topic `frames`)."""
 
     camera: Camera
+
+
+@dataclass(frozen=True)
+class Effort(Value):
+    """What was given up at a frame to keep the budget of the run (topic `effort`): how many words of `budget_order` hold, from the first."""
+
+    level: Annotated[int, Within(0, 100)]
 
 
 @dataclass(frozen=True)
