@@ -95,7 +95,7 @@ class FrameReference(Value):
 
 @dataclass(frozen=True)
 class Effort(Value):
-    """What was given up at a frame to keep the budget of the run (topic `effort`): how many words of `budget_order` hold, from the first."""
+    """Number of the words of `budget_order`, from the first, that hold at a frame to keep the run's budget of time (topic `effort`)."""
 
     level: Annotated[int, Within(0, 100)]
 

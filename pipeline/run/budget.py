@@ -41,7 +41,7 @@ class Budget:
 
 
 class Decisions(Protocol):
-    """How many words hold at each frame."""
+    """Number of words that hold at each frame."""
 
     def level(self, position: int) -> int:
         """Return the number at a position, from any thread."""
