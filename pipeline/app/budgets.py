@@ -20,20 +20,32 @@ from trihedron.pipeline.run.budget import Budget
 PLACE = "budget_order"
 WORD = re.compile(r"(\w+)(?:\.(\w+))?=([\w.+-]+)")  # a name, a number, true or false: no path
 MOST_WORDS = 20
+USUAL = ("keypoints.features=600", "bundle=none", "loop=none")  # those of them that fit a graph, where no order is given
 
 
 def budget_of(config: DictConfig, graph: Graph) -> Budget | None:
-    """Return the budget of a configuration and its graph; None without `budget_ms`. Raises ConfigError, one line, for words that cannot be taken."""
+    """Return the budget of a configuration and its graph; None without `budget_ms`. The usual order, where none is given, is written into the
+    configuration, which a recording states. Raises ConfigError, one line, for words that cannot be taken."""
     if config.budget_ms is None:
         return None
     if not 0.0 < config.budget_ms < float("inf"):
         raise ConfigError("budget_ms", f"{config.budget_ms} is not a time", "give milliseconds, for example budget_ms=33")
+    if not config.budget_order:
+        config.budget_order = [word for word in USUAL if _fits(config, graph, word)]
     if not 1 <= len(config.budget_order) <= MOST_WORDS:
         raise ConfigError(PLACE, f"has {len(config.budget_order)} words", f"give 1 to {MOST_WORDS}, for example '{PLACE}=[bundle=none]'")
     config, stages = config.copy(), list[Stage]()
     for word in config.budget_order:
         stages.append(_changed_stage(config, graph, str(word)))
     return Budget(float(config.budget_ms), tuple(map(str, config.budget_order)), tuple(stages))
+
+
+def _fits(config: DictConfig, graph: Graph, word: str) -> bool:
+    """Say if a word of the usual order saves something of a graph."""
+    slot, option, value = WORD.fullmatch(word).groups()  # type: ignore[union-attr]
+    if slot not in graph.stages:
+        return False
+    return config[slot][PLUGIN_KEY] != value if option is None else config[slot].get(option, 0) > int(value)
 
 
 def _changed_stage(config: DictConfig, graph: Graph, word: str) -> Stage:

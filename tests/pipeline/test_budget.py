@@ -149,13 +149,27 @@ def test_each_word_changes_the_stage_that_those_before_it_left() -> None:
     assert options == [(1000, 8), (600, 8), (600, 4), (600, 4)]
     assert type(budget.in_force(graph.stages["bundle"], 3).plugin).__name__ == "NoBundle" and config.keypoints.features == 1000
     assert [changed.first for changed in budget.each()] == [1, 2, 3]
+
+
+@pytest.mark.parametrize(
+    ("words", "order"),
+    [
+        ([], ["keypoints.features=600", "bundle=none", "loop=none"]),
+        (["keypoints.features=500", "without=loop"], ["bundle=none"]),
+        (["keypoints=sift", "bundle=none"], ["loop=none"]),
+    ],
+)
+def test_the_usual_order_is_what_saves_something(words: list[str], order: list[str]) -> None:
+    config = compose_run(["budget_ms=33", *words])
+    graph = graph_of(config)
+    budget = budget_of(config, graph)
+    assert budget is not None and list(budget.words) == order == list(config.budget_order)
     assert budget_of(compose_run([]), graph) is None
 
 
 @pytest.mark.parametrize(
     ("order", "message"),
     [
-        ("", "has 0 words; give 1 to 20, for example 'budget_order=[bundle=none]'"),
         ("bundle", "'bundle' is no STAGE=PLUGIN or STAGE.OPTION=VALUE; give for example keypoints.features=500 or bundle=none"),
         ("keypoint.features=5", "keypoint.features=5: 'keypoint' is no stage of this graph; did you mean 'keypoints'?"),
         ("keypoints.feature=5", "keypoints.feature=5: keypoints=orb has no option 'feature'; did you mean 'features'?"),
@@ -174,6 +188,10 @@ def test_a_wrong_order_is_one_line(order: str, message: str) -> None:
 @pytest.mark.parametrize(
     ("words", "message"),
     [
+        (
+            ["budget_ms=33", "graph=direct"],
+            "budget_order: has 0 words; give 1 to 20, for example 'budget_order=[bundle=none]'",
+        ),
         (["budget_ms=0"], "budget_ms: 0.0 is not a time; give milliseconds, for example budget_ms=33"),
         (["budget_ms=33", "budget_order=[keypoints.features=0]"], "keypoints.features: "),
         (["budget_ms=33", "budget_order=[bundle=nothing]"], "bundle: there is no plugin 'nothing' for the slot 'bundle'"),
