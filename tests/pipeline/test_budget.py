@@ -171,6 +171,7 @@ def test_the_usual_order_is_what_saves_something(words: list[str], order: list[s
     ("order", "message"),
     [
         ("bundle", "'bundle' is no STAGE=PLUGIN or STAGE.OPTION=VALUE; give for example keypoints.features=500 or bundle=none"),
+        ("keypoints.model=/a.onnx", "'keypoints.model=/a.onnx' is no STAGE=PLUGIN or STAGE.OPTION=VALUE; "),
         ("keypoint.features=5", "keypoint.features=5: 'keypoint' is no stage of this graph; did you mean 'keypoints'?"),
         ("keypoints.feature=5", "keypoints.feature=5: keypoints=orb has no option 'feature'; did you mean 'features'?"),
         ("dataset.length=5", "dataset.length=5: 'dataset' cannot be changed in mid-run; known: "),
