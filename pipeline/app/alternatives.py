@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
+from trihedron.pipeline.app.budgets import budget_of
 from trihedron.pipeline.app.compilation import compile_once
 from trihedron.pipeline.app.execute import (
     RECORDING,
@@ -105,7 +106,8 @@ class Alternatives:
         graph, config = alternative.graph, alternative.config
         only = tuple(name for name in graph.stages if name in self.stages)
         replay = Replay(self.recording, only, self.feedback is Feedback.recorded)
-        return Runner(graph, config.seed, self.threads, replay, str(config.dataset.get("frames", "")), remembered_of(config, graph))
+        frames, remembered, budget = str(config.dataset.get("frames", "")), remembered_of(config, graph), budget_of(config, graph)
+        return Runner(graph, config.seed, self.threads, replay, frames, remembered, budget=budget)
 
     def run(self, folders: Sequence[Path], on_frame: Frames) -> None:
         """Compute all frames; each alternative's files go to its folder, the values of all to `on_frame(index, values)`. Raises TrihedronError."""

@@ -64,6 +64,8 @@ Usage: trihedron run [-m] [key=value ...]
                                      what is served stays until Ctrl-C, with view.keep=false it ends with the run
   live=true                          play the data set in real time; frames that come while it is busy are dropped, latency is reported
   real_time=true                     the same without dropping any
+  budget_ms=33                       a frame may take that long on average; else the words of 'budget_order=[...]' hold, one after the other:
+                                     keypoints.features=600, bundle=none, loop=none; each decision is recorded
   feedback=recorded                  each recomputed stage by itself: all its inputs are as recorded
   -m                                 sweep over comma-separated values, on all cores; the same again does what is missing
   -m ... --dry-run                   say which jobs a sweep has, which are done, and which stages they share; run nothing

@@ -18,6 +18,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
+from trihedron.pipeline.app.budgets import budget_of
 from trihedron.pipeline.app.compilation import compile_once
 from trihedron.pipeline.app.trajectory_plot import PLOT, trajectory_figure
 from trihedron.pipeline.app.viewers import Viewer, opened_viewer
@@ -78,7 +79,8 @@ def _execute(config: DictConfig, out: Path, overrides: list[str], began: float, 
     replay = _replay(config, graph)
     frames = str(config.dataset.get("frames", "")) if config.dataset is not None else ""
     remembered, source = remembered_of(config, graph), source_of(config)
-    runner = Runner(graph, config.seed, config.threads, replay, frames, remembered, _pace(config), preview_period=viewer.preview_period)
+    budget, period = budget_of(config, graph), viewer.preview_period
+    runner = Runner(graph, config.seed, config.threads, replay, frames, remembered, _pace(config), preview_period=period, budget=budget)
     topics = recorded_topics(config, graph, replay)
     _announce(runner)
     trial = partial(Runner, graph, config.seed, config.threads, replay, frames, remembered)
@@ -88,6 +90,8 @@ def _execute(config: DictConfig, out: Path, overrides: list[str], began: float, 
         write_configuration(out, config, overrides)
         with Warnings() as warnings, compilation_reported():
             warm_up(trial())
+            for changed in budget.each() if budget is not None and replay is None else ():
+                warm_up(trial(budget=changed))
             warnings.muted = False
             metadata = {**metadata_of(config, overrides), TOPICS: json.dumps(sorted(topics))}
             attachments = _attachments(graph, replay)
@@ -283,6 +287,8 @@ def write_files(
     timing = runner.timing.summary(runner.threads, time.perf_counter() - started, started - began)
     if runner.feed is not None:
         timing["live"] = runner.feed.summary(timing["frame_ms"])
+    if runner.effort is not None:
+        timing["budget"] = runner.effort.summary()
     try:
         if "pose" in runner.computed:
             result = results.with_unpacked_poses(runner.result)
@@ -330,6 +336,8 @@ def _report(out: Path, metrics: dict[str, Any], timing: dict[str, Any], surfaces
         late = live["latency_ms"]
         counts = f"{live['came']} frames came, {live['taken']} were taken, {live['dropped']} dropped"
         print(f"live: {counts}; a pose is ready {late['p50']:.0f} ms after its frame came (median; at most {late['max']:.0f} ms)")
+    if budget := timing.get("budget"):
+        print(budget_line(budget))
     if "final" in metrics:
         print(f"ATE {metrics['final']['ate_rmse_m']:.4f} m (as tracked {metrics['causal']['ate_rmse_m']:.4f} m)")
     for line in surfaces:
@@ -337,6 +345,12 @@ def _report(out: Path, metrics: dict[str, Any], timing: dict[str, Any], surfaces
     for path in sorted(out.iterdir()):
         if path.is_file():
             print(f"  {path}")
+
+
+def budget_line(budget: Mapping[str, Any]) -> str:
+    """Say in one line how many frames had all of a graph, and how many had less to keep the budget."""
+    counts = [f"{count} frames with {word}" for word, count in zip(["all stages as configured", *budget["words"]], budget["frames"]) if count]
+    return f"budget {budget['ms']:g} ms: {', '.join(counts)}" + (" and what is before it" if sum(map(bool, budget["frames"][2:])) else "")
 
 
 class Warnings(logging.Handler):

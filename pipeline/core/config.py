@@ -113,6 +113,8 @@ class RunOptions:
     load_map: str = ""  # go on from such a file
     localise_only: bool = False  # the loaded map stays as it is
     live: bool = False  # frames come at the camera's rate, and those for which the run comes too late are dropped
+    budget_ms: float | None = None  # mean time from when a frame is there to its pose; above it the words of budget_order hold, one after the other
+    budget_order: list[str] = dataclasses.field(default_factory=list)  # [] = budgets.USUAL
     view: Any = None  # show the run while it goes on: foxglove or rerun
     real_time: bool = False  # frames come at the camera's rate, none is dropped
     hydra: Any = dataclasses.field(

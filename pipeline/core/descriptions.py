@@ -18,6 +18,7 @@ from trihedron.pipeline.core.types import (
     OK,
     Building,
     Correction,
+    Effort,
     Frame,
     FrameReference,
     Keypoints,
@@ -101,6 +102,11 @@ def _(value: Frame) -> str:
 @describe.register
 def _(value: FrameReference) -> str:
     return line_of(value, f"{value.index} at {value.stamp_ns / 1e9:.3f} s", f"{value.camera.width} × {value.camera.height}")
+
+
+@describe.register
+def _(value: Effort) -> str:
+    return line_of(value, _number(value), counted((value.level, "word of the budget in force")))
 
 
 @describe.register

@@ -13,7 +13,7 @@ PATH_KEYS = frozenset({
     "out", "replay", "load_map", "save_map", "dataset.path", "dataset.camera", "dataset.options.path", "dataset.options.camera",
     "keypoints.model", "lines.model", "normals.model", "planes.model", "tracks.model", "loop.model",
 })  # fmt: skip
-LISTS = ("sequences", "alternatives")
+LISTS = ("sequences", "alternatives", "budget_order")
 SYNONYMS = {"record.frames=foxglove": "record.frames=true"}  # frames are embedded in Foxglove's schemas
 PLAIN = re.compile(r"[\w./:+@%-]+", re.ASCII)  # a value that Hydra reads as it is written
 BRACKETS = {"[": "]", "(": ")", "{": "}"}
@@ -44,7 +44,7 @@ def path_of(word: str) -> tuple[str, str] | None:
 
 
 def with_literal_paths(words: Iterable[str], sweep: bool = False) -> list[str]:
-    """Quote the values of paths, `sequences` and `alternatives` for Hydra, and replace SYNONYMS.
+    """Quote the values of paths and the elements of LISTS for Hydra, and replace SYNONYMS.
 
     In a sweep `A,B` are several paths, unless one of that name exists."""
     return [_literal_word(word, sweep) for word in words]

@@ -23,7 +23,15 @@ from trihedron.pipeline.core.registry import load_packages, plugin_class
 from trihedron.pipeline.core.renamed import current_option, current_plugin
 from trihedron.pipeline.core.slots import SLOTS
 
-ROOT_KEYS = ("seed", "outputs", "record", "load_map", "localise_only")  # of a run, besides slots and wires, that a replay takes
+ROOT_KEYS = (
+    "seed",
+    "outputs",
+    "record",
+    "load_map",
+    "localise_only",
+    "budget_ms",
+    "budget_order",
+)  # of a run, besides slots and wires, that a replay takes
 MAX_CHARACTERS = 200_000  # of the YAML; a full configuration has 6 000
 MAX_DEPTH = 8  # of nested lists and mappings; a configuration has 3
 SHOWN = 60  # characters of a stranger's text in a message

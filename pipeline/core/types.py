@@ -44,6 +44,7 @@ __all__ = [
     "Column",
     "Correction",
     "DepthNoise",
+    "Effort",
     "Frame",
     "FrameReference",
     "Keypoints",
@@ -90,6 +91,13 @@ class FrameReference(Value):
     """A stand-in for a frame in a recording that does not embed it (topic `frames`)."""
 
     camera: Camera
+
+
+@dataclass(frozen=True)
+class Effort(Value):
+    """Number of the words of `budget_order`, from the first, that hold at a frame to keep the run's budget of time (topic `effort`)."""
+
+    level: Annotated[int, Within(0, 100)]
 
 
 @dataclass(frozen=True)

@@ -6,11 +6,12 @@ from collections.abc import Mapping
 from typing import Any
 
 from trihedron.pipeline.core.graph import Graph
-from trihedron.pipeline.core.types import Frame, FrameReference, Trajectory, Value
+from trihedron.pipeline.core.types import Effort, Frame, FrameReference, Trajectory, Value
 from trihedron.pipeline.record.codec import FRAMES_TOPIC
 from trihedron.pipeline.record.foxglove import TopicView
 from trihedron.pipeline.record.writer import RecordingWriter
 from trihedron.pipeline.run.accounting import FrameTimes
+from trihedron.pipeline.run.budget import EFFORT_TOPIC
 from trihedron.pipeline.run.replay import Plan
 from trihedron.pipeline.run.timing import resident_mb
 
@@ -28,6 +29,8 @@ class Recorder:
         """Write one frame."""
         if (reference := self._reference_of(index, values.get("dataset"))) is not None:
             self._writer.write(FRAMES_TOPIC, reference)
+        if isinstance(effort := values.get(EFFORT_TOPIC), Effort):
+            self._writer.write(EFFORT_TOPIC, effort)
         for name in self._computed:
             if isinstance(value := values.get(name), Value):
                 if name in self._topics:

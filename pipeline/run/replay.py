@@ -14,14 +14,15 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
-from trihedron.pipeline.core.errors import DataError, RecordingError
+from trihedron.pipeline.core.errors import ConfigError, DataError, RecordingError
 from trihedron.pipeline.core.graph import Graph
 from trihedron.pipeline.core.options import frame_range
 from trihedron.pipeline.core.slots import CAMERA, SLOTS
-from trihedron.pipeline.core.types import Frame, FrameReference, Value
+from trihedron.pipeline.core.types import Effort, Frame, FrameReference, Value
 from trihedron.pipeline.core.wires import Wire
 from trihedron.pipeline.record.codec import FRAMES_TOPIC
 from trihedron.pipeline.record.reader import Recording, TopicReader
+from trihedron.pipeline.run.budget import EFFORT_TOPIC, Budget
 from trihedron.pipeline.run.live import is_camera
 
 RECORDED = "recorded:"  # prefix of the node that reads a topic from the file
@@ -59,6 +60,16 @@ class Replay:
     def reader(self, topic: str) -> Callable[[int], Value | None]:
         """Return a function from frame number to recorded value, to be called with increasing numbers."""
         return TopicReader(self.recording, topic).at if topic in self.recording.topics | {FRAMES_TOPIC} else lambda index: None
+
+    def effort(self, budget: Budget) -> dict[int, int]:
+        """Return frame number -> words of the budget that held. Raises ConfigError where the run had no budget, or one of more words."""
+        if EFFORT_TOPIC not in self.recording.topics:
+            cause = f"{self.recording.path} was recorded without a budget, and a replay takes the decisions of its run"
+            raise ConfigError("budget_ms", cause, "leave it out")
+        levels = {value.index: value.level for value in self.recording.values(EFFORT_TOPIC) if isinstance(value, Effort)}
+        if (most := max(levels.values(), default=0)) > len(budget.words):
+            raise ConfigError("budget_order", f"has {len(budget.words)} words, and up to {most} held in the recorded run", "leave it out")
+        return levels
 
     def references(self, frames: str) -> dict[int, FrameReference]:
         """Return frame number -> reference for the recorded frames in a range. Raises RecordingError when there is none."""

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from trihedron.pipeline.core import types
 from trihedron.pipeline.core.errors import StageError, TrihedronError
 from trihedron.pipeline.core.graph import Graph, Stage
 from trihedron.pipeline.core.registry import check_value
@@ -27,6 +28,7 @@ from trihedron.pipeline.core.wires import Wire
 from trihedron.pipeline.record.reader import TopicReader
 from trihedron.pipeline.record.writer import RecordingWriter
 from trihedron.pipeline.run.accounting import Accounting
+from trihedron.pipeline.run.budget import EFFORT_TOPIC, Budget, Decisions, Effort, Governor, RecordedDecisions
 from trihedron.pipeline.run.frame_validation import FrameValidation
 from trihedron.pipeline.run.interrupts import Interrupts
 from trihedron.pipeline.run.live import Pace, feed_of
@@ -69,10 +71,12 @@ class Runner:
         pace: Pace = Pace.none,
         on_value: Callable[[int, str, Value | None], None] | None = None,
         preview_period: int = 0,
+        budget: Budget | None = None,
     ) -> None:
         """`initial` returns the values of delayed wires before the frame of a given number, `pace` is when frames may be read. `on_value` is called
         with position, stage and value as soon as a stage is done with a frame, from any thread. Every
-        `preview_period` frames sinks get what a fold has so far, if its plugin has a method `preview(state)`; 0: never."""
+        `preview_period` frames sinks get what a fold has so far, if its plugin has a method `preview(state)`; 0: never. Some stages
+        are other ones at frames whose predecessors exceed the `budget`."""
         self._on_value = on_value
         self.graph, self.seed, self.threads, self.replay = graph, seed, threads, replay
         self.plan = plan_run(graph, replay, frames)
@@ -89,10 +93,14 @@ class Runner:
         self.validation = FrameValidation(self.plan.stamps_ns, self.count if self.feed is None else 0)
         self._time_offset = TimeOffsetCheck()
         self._sources = str(replay.recording.path) if replay is not None else "load_map" if self.initial.held else ""  # files of inputs
+        self.effort = Effort(budget, self._decisions(budget)) if budget is not None else None
         self._fold_states: dict[str, Any] = {}
         self._preview_period = preview_period
         self._previews: deque[tuple[str, Value]] = deque()
         self.sinks: tuple[Sink, ...] = ()
+
+    def _decisions(self, budget: Budget) -> Decisions:
+        return Governor(budget) if self.replay is None else RecordedDecisions(self.replay.effort(budget), self.indices)
 
     def steps(
         self,
@@ -140,6 +148,9 @@ class Runner:
         self.state.append(index, values)
         if accounts.take(position, index, values, self.count, position in self.validation.late):
             self._judge_time_offset(values.get("dataset"), values.get("pose"))
+            if self.effort is not None:
+                level = self.effort.take(position, index, accounts.times[position].latency_ms or 0.0)
+                values = {**values, EFFORT_TOPIC: types.Effort(index, accounts.stamps_ns[index], level)}
             for sink in self.sinks:
                 sink.frame(index, accounts.stamps_ns[index], values, accounts.times[position])
             while self._previews:
@@ -209,6 +220,8 @@ class Runner:
 
     def _call(self, stage: Stage, position: int, values: Mapping[str, Any]) -> Value | None:
         """Skip, seed, time and check one call."""
+        if self.effort is not None and (changed := self.effort.stage(stage, position)) is not stage:
+            stage, values = changed, {parameter: values[parameter] for parameter in changed.inputs}
         if any(values[parameter] is None for parameter in stage.required):
             return None
         arguments = {**dict.fromkeys(stage.absent), **values}

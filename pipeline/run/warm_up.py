@@ -136,7 +136,9 @@ _WARM: set[str] = set()  # stages with their options, and data sets, that this p
 def warm_up(runner: Runner) -> None:
     """Call every stage on the first frames and discard the results, unless this process has done so for all of them; an error here is left to the
     run itself, which reports it."""
-    plugins = {name: runner.graph.stages[name].plugin for name in runner.computed}
+    called = {name: runner.graph.stages[name] for name in runner.computed}
+    called |= {name: runner.effort.stage(stage, 0) for name, stage in called.items()} if runner.effort is not None else {}
+    plugins = {name: stage.plugin for name, stage in called.items()}
     stages = {f"{name}={type(plugin) if name == 'dataset' else plugin!r}" for name, plugin in plugins.items()}
     if stages <= _WARM:
         return

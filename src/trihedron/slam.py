@@ -24,6 +24,7 @@ from trihedron.camera import Camera
 from trihedron.datasets.readers.cameras import Calibration
 from trihedron.datasets.simulation.synthetic import Synthetic
 from trihedron.images import Frames, stamp_of
+from trihedron.pipeline.app.budgets import budget_of
 from trihedron.pipeline.app.compilation import compile_once
 from trihedron.pipeline.app.execute import RECORDING, metadata_of, recorded_topics, remembered_of, source_of, write_files, write_models
 from trihedron.pipeline.app.viewers import Viewer, opened_viewer
@@ -130,8 +131,10 @@ class Slam:
         self._out = Path(out).expanduser().absolute() if out is not None else None
         try:
             viewer = self._stack.enter_context(opened_viewer(self._config))
-            initial, period = remembered_of(self._config, graph), viewer.preview_period
-            self._runner = Runner(graph, self._config.seed, self._config.threads, None, "", initial, on_value=self._note, preview_period=period)
+            initial, period, budget = remembered_of(self._config, graph), viewer.preview_period, budget_of(self._config, graph)
+            self._runner = Runner(
+                graph, self._config.seed, self._config.threads, None, "", initial, on_value=self._note, preview_period=period, budget=budget
+            )  # fmt: skip
             self._sinks: tuple[Sink, ...] = (self._memory, *viewer.sinks)
             self._open(graph, viewer)
         except BaseException:
