@@ -90,6 +90,10 @@ def test_what_is_seen_while_lost_becomes_a_sub_map_and_is_tied_when_the_turn_is_
     assert {pose.status for index, pose in poses.items() if begun <= index < tied} == {"degraded"}
     assert metrics["unmerged"] == 1 and metrics["status"]["lost"] == begun - 60
     assert metrics["final"]["ate_rmse_m"] < 0.01
+    assert main(["run", f"replay={tmp_path / 'run' / 'run.mcap'}", "map.apart=[1]", f"out={tmp_path / 'apart'}"]) == 0  # the merge is undone
+    *_, map = Recording(tmp_path / "apart" / "run.mcap").values("map")
+    assert set(map.keyframes.column("submap")) == {0, 1}
+    assert json.loads((tmp_path / "apart" / "metrics.json").read_text())["unmerged"] == 620 - begun
 
 
 @pytest.mark.slow

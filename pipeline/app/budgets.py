@@ -45,7 +45,7 @@ def _fits(config: DictConfig, graph: Graph, word: str) -> bool:
     slot, option, value = WORD.fullmatch(word).groups()  # type: ignore[union-attr]
     if slot not in graph.stages:
         return False
-    return config[slot][PLUGIN_KEY] != value if option is None else config[slot].get(option, 0) > int(value)
+    return bool(config[slot][PLUGIN_KEY] != value if option is None else config[slot].get(option, 0) > int(value))
 
 
 def _changed_stage(config: DictConfig, graph: Graph, word: str) -> Stage:

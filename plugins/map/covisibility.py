@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass, replace
 from typing import Annotated
 
@@ -32,6 +33,7 @@ from trihedron.plugins.mapping.reference_keyframe import submap_of, transform_to
 from trihedron.plugins.mapping.submaps import merge_submaps
 from trihedron.plugins.none import NoMap
 
+log = logging.getLogger("trihedron")
 NEARBY = {"newest": 2, "covisible": 10, "near": 3}  # keyframes whose planes should be observed again: as many as tracking searches
 
 
@@ -54,6 +56,7 @@ class Covisibility(KeyframeOptions):
     merge_deg: float = 4.0  # planes that differ by less, and by less than merge_m on average, become one
     merge_m: float = 0.03  # mean distance of planes that become one
     verified_by: PositiveInt = 3  # views that agree on the motion between two sub-maps before these are merged; 1 = merge at the first recognised
+    apart: tuple[int, ...] = ()  # sub-maps that are not merged with older ones: undoes a merge that was wrong, in a replay
 
     def __call__(
         self,
@@ -92,11 +95,15 @@ class Covisibility(KeyframeOptions):
 
     def _merge(self, map: Map, pose: Pose, recognised: Pose) -> Map:
         """The map whose sub-map of `pose` is merged with the one in which it was recognised, or in which that is proposed."""
+        if (number := submap_of(pose, map)) in self.apart:
+            return map
         if self.verified_by > 1:
             map, verified = propose_merge(map, pose, recognised, self.verified_by)
             if verified is None:
                 return map
             recognised = verified
+        if number != recognised.submap:
+            log.warning("map: sub-map %d is merged with %d at frame %d; map.apart=[%d] undoes it", number, recognised.submap, pose.index, number)
         return replace(merge_submaps(map, pose, recognised, self.merge_deg, self.merge_m), loop_closed=map.revision + 1)
 
     def _version(self, map: Map, frame: Frame) -> Map:

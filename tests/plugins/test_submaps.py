@@ -97,6 +97,20 @@ def test_a_sub_map_is_merged_by_the_third_keyframe_that_is_recognised(both):
     assert all(np.allclose(poses[row], camera_at(step), atol=1e-6) for row, step in zip(range(6, 15), (*range(12, 36, 4), 33, 36, 39)))
 
 
+def test_a_merge_is_undone_by_keeping_the_sub_map_apart(both, caplog):
+    """The frame that merges it says how; with that the map goes on in the sub-map's own world."""
+    world, map = both
+    merging = {"status": "degraded", "submap": 1, "reference": 11, "recognised": pose_of(camera_at(33), 12, "degraded", submap=0)}
+    merged = seen(world, map, 12, 33, AWAY @ camera_at(33), **merging)
+    assert caplog.messages == ["map: sub-map 1 is merged with 0 at frame 12; map.apart=[1] undoes it"]
+    apart = seen(world, map, 12, 33, AWAY @ camera_at(33), stage=dataclasses.replace(EVERY, apart=(1,)), **merging)
+    assert not merged.keyframes.column("submap").any() and apart.keyframes.column("submap").tolist() == [0] * 6 + [1] * 7
+    assert np.allclose(apart.keyframes.column("T_world_camera")[12], AWAY @ camera_at(33)) and apart.loop_closed == map.loop_closed
+    assert apart.planes.column("alive").sum() == 6 and len(caplog.messages) == 1
+    other = dataclasses.replace(EVERY, apart=(2,))
+    assert not seen(world, map, 12, 33, AWAY @ camera_at(33), stage=other, **merging).keyframes.column("submap").any()
+
+
 def test_an_adjustment_that_began_before_sub_maps_were_merged_does_not_undo_it(both):
     """The bundle adjustment of the version before still has the keyframes in the world of the sub-map."""
     world, map = both
