@@ -307,7 +307,8 @@ def test_a_stage_alone_says_what_it_computes_besides(folder, camera, capsys):
         ),
         (
             lambda d, c: th.keypoints.onnx(preset="xfeet"),
-            "keypoints.onnx: preset: 'xfeet' is not one of superpoint, aliked, xfeat, disk; did you mean 'xfeat'?; see trihedron plugins keypoints onnx",
+            "keypoints.onnx: preset: 'xfeet' is not one of superpoint, aliked, xfeat, disk; did you mean 'xfeat'?; "
+            "see trihedron plugins keypoints onnx",
         ),
         (
             lambda d, c: th.dataset.synthetic(motion=3),

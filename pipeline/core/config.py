@@ -345,4 +345,6 @@ def _cure_of_option(group: str, option: str, owners: Mapping[str, type[Any]]) ->
     """Return the cure for an option that the chosen one of a group's `owners` has not: which ones have it, else the closest name there is."""
     options = {name: {f.name for f in options_of(owner)} for name, owner in owners.items()}
     having = sorted(name for name, known in options.items() if option in known)
-    return f"it belongs to {group}={' or '.join(having)}" if having else did_you_mean(option, {known for names in options.values() for known in names})
+    return (
+        f"it belongs to {group}={' or '.join(having)}" if having else did_you_mean(option, {known for names in options.values() for known in names})
+    )
