@@ -83,17 +83,17 @@ def register(slot: str, name: str) -> Callable[[Plugin], Plugin]:
 def _check_when_constructed(plugin: type) -> None:
     """Make each construction of a plugin take the names of enumerations' members, and raise ValueError for an option out of its range."""
     initialise = plugin.__init__  # type: ignore[misc]
+    enums_once = functools.cache(functools.partial(_enums_of, plugin))
 
     @functools.wraps(initialise)
     def initialise_and_check(self: Any, *args: Any, **options: Any) -> None:
-        enums = _enums_of(type(self))
+        enums = enums_once()
         initialise(self, *args, **{name: _member(name, enums[name], value) if name in enums else value for name, value in options.items()})
         check_options(self)
 
     plugin.__init__ = initialise_and_check  # type: ignore[misc]
 
 
-@functools.cache
 def _enums_of(plugin: type[Any]) -> dict[str, type[Enum]]:
     """Return option -> its enumeration, for the options of a dataclass that have one."""
     return {name: hint for name, hint in get_type_hints(plugin).items() if isinstance(hint, type) and issubclass(hint, Enum)}
