@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 
 import trihedron as th
+from trihedron.datasets.simulation.motion import Motion
 from trihedron.datasets.simulation.synthetic import Synthetic
 from trihedron.pipeline.core import types
 from trihedron.pipeline.record import reader
+from trihedron.plugins.keypoints.onnx import KeypointNetwork
 from trihedron.stages import IMAGES
 
 LENGTH = 24
@@ -303,6 +305,15 @@ def test_a_stage_alone_says_what_it_computes_besides(folder, camera, capsys):
             lambda d, c: th.planes.connected_components(angl=3),
             "planes.connected_components(angl=...): the plugin has no such option; did you mean 'angle_deg'?",
         ),
+        (
+            lambda d, c: th.keypoints.onnx(preset="xfeet"),
+            "keypoints.onnx: preset: 'xfeet' is not one of superpoint, aliked, xfeat, disk; did you mean 'xfeat'?; "
+            "see trihedron plugins keypoints onnx",
+        ),
+        (
+            lambda d, c: th.dataset.synthetic(motion=3),
+            "dataset.synthetic: motion: '3' is not one of walk, fast, still, pan; see trihedron plugins dataset synthetic",
+        ),
         (lambda d, c: th.keypoints.orb()(d, c), "keypoints.orb: rgb: is not given, and keypoints are found in it; give rgb (h, w, 3) before depth"),
         (lambda d, c: th.planes.ransac()(d), "planes.ransac: camera: is not given; give trihedron.Camera(...) after the images"),
         (lambda d, c: th.planes.ransac()(c), "planes.ransac: depth: is not given; give depth (h, w) and a camera, or a frame"),
@@ -324,6 +335,11 @@ def test_mistakes_with_a_stage(folder, camera, call, message, capsys):
         call(depth, camera)
     assert str(error.value) == message
     assert capsys.readouterr().err == ""  # nothing is announced that is not computed then
+
+
+def test_a_choice_is_given_by_its_name():
+    assert th.keypoints.onnx(preset="xfeat").plugin == th.keypoints.onnx(preset=KeypointNetwork.xfeat).plugin
+    assert th.dataset.synthetic(motion="pan", length=1).motion is Motion.pan
 
 
 def test_help_of_a_stage_names_its_inputs():

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
 from enum import Enum
 from functools import cached_property
-from typing import Any, get_type_hints
+from typing import Any
 
 import numpy as np
 
@@ -191,23 +191,13 @@ class Faults:
 
     def _underneath(self, options: dict[str, Any]) -> Any:
         kind = plugin_class("dataset", self.of)
-        hints = get_type_hints(kind)
         known = [option.name for option in fields(kind)]
         if (unknown := next((name for name in options if name not in known), None)) is not None:
             raise ValueError(f"options: {self.of} has no option '{unknown}'; {did_you_mean(unknown, known)}")
-        return kind(**{name: _as(hints.get(name), value) for name, value in options.items()})
+        return kind(**options)
 
 
 def _refuse_sizes(number: int, depth: F32, times: float) -> None:
     h, w = depth.shape
     cause = f"depth is {round(times * w)}×{round(times * h)} while colour is {w}×{h}"
     raise DataError(f"frame {number}", cause, "register depth to colour first")
-
-
-def _as(hint: Any, value: Any) -> Any:
-    """A name as the member of an enumeration where one is wanted. Raises ValueError for a name it has not."""
-    if isinstance(hint, type) and issubclass(hint, Enum) and not isinstance(value, hint):
-        if value not in hint.__members__:
-            raise ValueError(f"options: '{value}' is not one of {', '.join(hint.__members__)}")
-        return hint[value]
-    return value

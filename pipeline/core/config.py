@@ -288,7 +288,7 @@ def rewrite_error(error: Exception) -> TrihedronError:
     if isinstance(error, MissingConfigException) and (match := re.search(r"Could not find '([\w/]+)/([^'/]*)'", text)):
         return _unknown_option(match[1], match[2], list(error.options or []))
     if match := re.search(r"Could not override '([\w./]+)'", text):
-        return _unknown_key(match[1])
+        return _unknown_key(match[1], getattr(cause, "object_type", None))
     if isinstance(cause, ValidationError) and "is not a ListConfig" in str(cause):
         return ConfigError(str(getattr(cause, "full_key", "")), "is not a list", "write it as [A,B], quoted for the shell")
     if isinstance(cause, ValidationError):
@@ -328,16 +328,25 @@ def _unknown_option(group: str, name: str, options: list[str]) -> TrihedronError
     return ConfigError(group, f"there is no {group} '{name}'", did_you_mean(name, options))
 
 
-def _unknown_key(key: str) -> TrihedronError:
+def _unknown_key(key: str, owner: Any) -> TrihedronError:
+    """Return the error of a key that its `owner`, the dataclass of its group, has not."""
     group, _, option = key.rpartition(".")
     if group in SLOTS:
         load_plugins()
-        owners = {name: {f.name for f in options_of(plugin)} for name, plugin in plugins_of(group).items()}
-        having = sorted(name for name, options in owners.items() if option in options)
-        all_options = {known for options in owners.values() for known in options}
-        cure = f"it belongs to {group}={' or '.join(having)}" if having else did_you_mean(option, all_options)
-        return ConfigError(key, f"the chosen plugin has no option '{option}'", cure)
+        return ConfigError(key, f"the chosen plugin has no option '{option}'", _cure_of_option(group, option, plugins_of(group)))
     if group == "view":
+        viewer = next((name for name, kind in VIEWS.items() if kind is owner), "")
+        if viewer:
+            return ConfigError(key, f"view={viewer} has no option '{option}'", _cure_of_option(group, option, VIEWS))
         return ConfigError(key, "no viewer with this option is chosen", f"give view={' or view='.join(VIEWS)} too")
     known = {f.name for f in dataclasses.fields(RunOptions) if f.name not in ("defaults", "hydra")} | set(SLOTS)
     return ConfigError(key, "there is no such key", did_you_mean(key, known) if not group else "see trihedron run --help")
+
+
+def _cure_of_option(group: str, option: str, owners: Mapping[str, type[Any]]) -> str:
+    """Return the cure for an option that the chosen one of a group's `owners` has not: which ones have it, else the closest name there is."""
+    options = {name: {f.name for f in options_of(owner)} for name, owner in owners.items()}
+    having = sorted(name for name, known in options.items() if option in known)
+    return (
+        f"it belongs to {group}={' or '.join(having)}" if having else did_you_mean(option, {known for names in options.values() for known in names})
+    )

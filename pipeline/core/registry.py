@@ -13,6 +13,7 @@ import pkgutil
 import sys
 import threading
 from collections.abc import Callable
+from enum import Enum
 from importlib.metadata import entry_points
 from importlib.util import find_spec
 from pathlib import Path
@@ -80,15 +81,32 @@ def register(slot: str, name: str) -> Callable[[Plugin], Plugin]:
 
 
 def _check_when_constructed(plugin: type) -> None:
-    """Make each construction of a plugin raise ValueError for an option out of its range, whoever constructs it."""
+    """Make each construction of a plugin take the names of enumerations' members, and raise ValueError for an option out of its range."""
     initialise = plugin.__init__  # type: ignore[misc]
+    enums_once = functools.cache(functools.partial(_enums_of, plugin))
 
     @functools.wraps(initialise)
     def initialise_and_check(self: Any, *args: Any, **options: Any) -> None:
-        initialise(self, *args, **options)
+        enums = enums_once()
+        initialise(self, *args, **{name: _member(name, enums[name], value) if name in enums else value for name, value in options.items()})
         check_options(self)
 
     plugin.__init__ = initialise_and_check  # type: ignore[misc]
+
+
+def _enums_of(plugin: type[Any]) -> dict[str, type[Enum]]:
+    """Return option -> its enumeration, for the options of a dataclass that have one."""
+    return {name: hint for name, hint in get_type_hints(plugin).items() if isinstance(hint, type) and issubclass(hint, Enum)}
+
+
+def _member(option: str, enum: type[Enum], value: Any) -> Enum:
+    """Return the member of an enumeration that a name stands for, or that is given itself. Raises ValueError for anything else."""
+    if isinstance(value, enum):
+        return value
+    if isinstance(value, str) and value in enum.__members__:
+        return enum[value]
+    close = did_you_mean(str(value), enum.__members__)
+    raise ValueError(f"{option}: '{value}' is not one of {', '.join(enum.__members__)}" + (f"; {close}" if close.startswith("did") else ""))
 
 
 def _source_of(plugin: type) -> str:

@@ -135,6 +135,9 @@ def test_a_viewer_that_cannot_be_opened_is_one_line_and_leaves_no_folder(tmp_pat
     )
     assert main(["run", "view.port=9", f"out={tmp_path / 'none'}"]) == 1
     assert capsys.readouterr().err == "trihedron: view.port: no viewer with this option is chosen; give view=foxglove or view=rerun too\n"
+    for option, cure in (("prt", "did you mean 'port'?"), ("web", "it belongs to view=rerun")):
+        assert main(["run", "view=foxglove", f"view.{option}=1", f"out={tmp_path / 'none'}"]) == 1
+        assert capsys.readouterr().err == f"trihedron: view.{option}: view=foxglove has no option '{option}'; {cure}\n"
     assert main(["run", "view=foxgloves", f"out={tmp_path / 'none'}"]) == 1
     assert capsys.readouterr().err == "trihedron: view: there is no view 'foxgloves'; did you mean 'foxglove'?\n"
     assert not (tmp_path / "none").exists()
