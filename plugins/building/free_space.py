@@ -8,7 +8,7 @@ import numpy as np
 
 from trihedron.pipeline.core.types import F64, Bool
 from trihedron.plugins.building.evidence import LEVEL_DEG, Evidence
-from trihedron.plugins.building.free_space_kernels import U32, carve_kernel
+from trihedron.plugins.building.free_space_kernels import LEVELS, U32, carve_kernel
 from trihedron.plugins.building.levels import Storey
 from trihedron.plugins.shared.voxel_hash_kernels import I64
 
@@ -34,6 +34,12 @@ class FreeSpace:
         out = np.zeros(len(points), np.uint32)
         out[inside] = self.levels[row[inside], column[inside]]
         return out
+
+    def passed(self, points: F64, bottom_m: float) -> Bool:
+        """Say of points (n, 3) if rays passed there; `bottom_m` is the height of the storey's floor."""
+        level = np.floor((points[:, 2] - bottom_m) / LEVEL_M)
+        bit = np.uint32(1) << np.clip(level, 0, LEVELS - 1).astype(np.uint32)
+        return np.asarray((level >= 0) & (level < LEVELS) & ((self.at(points[:, :2]) & bit) != 0), np.bool_)
 
     def within(self, points: F64) -> Bool:
         """Say of points (n, 2) if rays passed there or furniture stands there."""

@@ -49,10 +49,10 @@ def plan_building(
         here = in_storey(evidence, storeys, number)
         axes = directions(here, storey)
         upright, readings = upright_faces(here, storey, axes), upright_readings(here, storey)
-        if mirrors := mirrors_of(upright, readings, storey):
-            here = without_mirrors(here, mirrors)
-            upright, readings = upright_faces(here, storey, axes), upright_readings(here, storey)
         space = free_space(here, storey)
+        if mirrors := mirrors_of(upright, readings, space, storey):
+            here = without_mirrors(here, mirrors)
+            upright, readings, space = upright_faces(here, storey, axes), upright_readings(here, storey), free_space(here, storey)
         found = faces_of(upright, storey, space, min(SHORT_M, options.least_wall_m))
         faces, doubts = remove_furniture(found, here, storey, space, options.least_wall_m)
         faces += jog_sides(faces, here, space)

@@ -9,24 +9,24 @@ import numpy as np
 from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import F64, I32, Bool
 from trihedron.plugins.building.evidence import Evidence
-from trihedron.plugins.building.faces import HIGH_M, Face, close_gaps, longest_run, runs_of
-from trihedron.plugins.building.free_space import CELL_M, LEVEL_M
+from trihedron.plugins.building.faces import HIGH_M, LEAST_READINGS, Face, close_gaps, longest_run, runs_of
+from trihedron.plugins.building.free_space import CELL_M, LEVEL_M, FreeSpace
+from trihedron.plugins.building.free_space_kernels import LEVELS
 from trihedron.plugins.building.levels import Storey, sliding_sum
 from trihedron.plugins.shared.keyframe_views import KeyframeView
 from trihedron.plugins.shared.voxel_hash_kernels import I64
 
 EVERY = 4  # of the readings, one is compared
 BEFORE_M, BEHIND_M = 0.3, 0.15  # of an eye and of its reading, for a ray that crosses a face
-FACING, ASIDE_WEIGHT = 0.7, 0.3  # of readings of surfaces that face a line, others' weight: a wall square to it may go on behind it
+FACING = 0.7  # cosine, of surfaces that face a line, others are square to it
 SAME_M = 0.1  # side of the voxels in which readings are the same
 NEIGHBOURS = (0, 1 << 42, -(1 << 42), 1 << 22, -(1 << 22), 4, -4)  # steps of keys to voxels that share a side
 REACH = 3  # columns, of a face to the wall square to it that it reaches
-LEAST_FACING = 5  # readings of surfaces that face a line, which decide alone
-BROAD, LEAST_WEIGHT = 3, 3.0  # of readings in so many neighbouring columns of a face
-LEAST_SHARE = 0.5  # of the readings through a mirror that repeat what is before it
+BROAD, LEAST_WEIGHT = 3, 4.0  # neighbouring columns of a face that are judged together, the evidence that decides
+MOVED = 1e-4  # of the information of a reading that is put onto a mirror, which does not say where that is
 NARROWEST_M, RIM_M = 0.15, 0.05
 ASIDE_M = 0.4  # from the way of the camera to the jamb of what it goes through
-LEAST_FACE_M, WIDEST_M = 0.2, 1.2  # of a face that is read, of a gap in it
+LEAST_FACE_M, WIDEST_M = 0.2, 1.2  # of a face that is read, of a gap in it and of what is beside it
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Mirror:
         back."""
         before = matmul(eye[..., :2], self.normal) - self.offset_m
         behind = self.offset_m - matmul(points[:, :2], self.normal)
-        share = np.where((before > 0.0) & (behind > 0.0), before / np.maximum(before + behind, 1e-9), 1.0)
+        share = np.where((before > 0.0) & (behind > BEHIND_M), before / np.maximum(before + behind, 1e-9), 1.0)
         place = eye + share[:, None] * (points - eye)
         along = place[:, 0] * self.normal[1] - place[:, 1] * self.normal[0]
         inside = (along > self.span[0]) & (along < self.span[1]) & (place[:, 2] > self.heights[0]) & (place[:, 2] < self.heights[1])
@@ -65,13 +65,18 @@ class UprightReadings:
 
 @dataclass(frozen=True)
 class Crossing:
-    """Readings whose rays cross a line on the plan: where along it (n,) and at which heights (n,), what each counts for (n,), and if it repeats (n,),
-    reflected, what is before the line and is nothing that was read from behind it."""
+    """Readings whose rays cross a line on the plan: where along it (n,) and at which heights (n,), and what each counts for a mirror there (n,), less
+    than 0 against it; which (n,) are of surfaces that face the line."""
 
     along: F64
     height: F64
-    weight: F64
-    repeats: Bool
+    evidence: F64
+    facing: Bool
+
+    @property
+    def parts(self) -> tuple[F64, F64]:
+        """Return the evidence (n,) of surfaces that face the line, and that of others."""
+        return np.where(self.facing, self.evidence, 0.0), np.where(self.facing, 0.0, self.evidence)
 
 
 def upright_readings(evidence: Evidence, storey: Storey) -> UprightReadings:
@@ -82,55 +87,62 @@ def upright_readings(evidence: Evidence, storey: Storey) -> UprightReadings:
     return UprightReadings(points, normals, evidence.rows[chosen], evidence.eyes, keys, voxels.astype(np.int32))
 
 
-def mirrors_of(faces: list[Face], readings: UprightReadings, storey: Storey) -> list[Mirror]:
-    """Find the stretches of faces, high or not, through which most readings repeat what is before them, and that nobody walked through."""
+def mirrors_of(faces: list[Face], readings: UprightReadings, space: FreeSpace, storey: Storey) -> list[Mirror]:
+    """Find the stretches of faces, high or not, and of their lines beside them, through which most readings that tell repeat what is before the face,
+    and that nobody walked through."""
     found: list[Mirror] = []
+    wide = round(WIDEST_M / CELL_M)
     for face in faces:
-        framed = close_gaps(np.asarray(face.count[:, round(HIGH_M / LEVEL_M) :].any(axis=1), np.bool_), round(WIDEST_M / CELL_M))
+        framed = close_gaps(np.asarray(face.count[:, round(HIGH_M / LEVEL_M) :].sum(axis=1) >= LEAST_READINGS, np.bool_), wide)
         if longest_run(framed) * CELL_M >= LEAST_FACE_M:
-            found += _mirrors_on(face, framed, _crossing(readings, face, (face.start_m, face.start_m + CELL_M * len(framed))), storey, readings.eyes)
+            face = replace(face, start_m=face.start_m - WIDEST_M, count=np.pad(face.count, ((wide, wide), (0, 0))), tall=np.pad(face.tall, wide))
+            framed = np.pad(framed, wide)
+            crossing = _crossing(readings, space, storey, face, (face.start_m, face.start_m + CELL_M * len(framed)))
+            found += _mirrors_on(face, framed, crossing, storey, readings.eyes)
     return found
 
 
 def _mirrors_on(face: Face, framed: Bool, crossing: Crossing, storey: Storey, eyes: F64) -> list[Mirror]:
-    """Find the mirrors on the columns (k,) of a face that are read high up, or between such columns."""
+    """Find the mirrors on a face, of which columns (k,) are framed: read high up, or between such. Beside those only surfaces that face the mirror
+    are evidence: a wall square to it goes on there. A mirror ends with the columns that decide, and reaches from the floor to the top of the face."""
     columns = np.clip(np.floor((crossing.along - face.start_m) / CELL_M).astype(int), 0, len(framed) - 1)
     top = storey.bottom_m + LEVEL_M * (1 + np.nonzero(face.count.any(axis=0))[0][-1])
-    weight = np.where((crossing.height < top) & framed[columns], crossing.weight, 0.0)
-    weights = (np.bincount(columns, each, len(framed)) for each in (weight, weight * crossing.repeats))
-    every, repeated = (sliding_sum(each, np.ones(BROAD)) for each in weights)
+    counted = (crossing.height < top) & (crossing.facing | framed[columns])
+    crossed, facing, aside = (np.bincount(columns, counted * each, len(framed)) for each in (1.0, *crossing.parts))
+    around = _together(*(sliding_sum(each, np.ones(BROAD)) for each in (facing, aside)))
     found = []
-    for a, b in runs_of(np.asarray((repeated > LEAST_SHARE * every) & (every >= LEAST_WEIGHT), np.bool_)):
-        within = (weight > 0.0) & (columns >= a) & (columns < b)
+    for a, b in runs_of(np.asarray((sliding_sum(crossed, np.ones(BROAD)) > 0.0) & (around >= 0.0), np.bool_)):
+        sure = a + np.nonzero(around[a:b] >= LEAST_WEIGHT)[0]
+        a, b = (int(sure[0]), int(sure[-1]) + 1) if len(sure) else (a, a)
         span = face.start_m + CELL_M * a - RIM_M, face.start_m + CELL_M * b + RIM_M
-        if (b - a) * CELL_M < NARROWEST_M or not _repeats(crossing, within) or _is_walked_through(face, span, eyes):
+        if (b - a) * CELL_M < NARROWEST_M or _together(facing[a:b].sum(), aside[a:b].sum()) < LEAST_WEIGHT or _is_walked_through(face, span, eyes):
             continue
-        low, high = np.percentile(crossing.height[within], [1.0, 99.0])
-        found.append(Mirror(face.normal, face.offset_m, span, (float(low) - RIM_M, float(high) + RIM_M)))
+        found.append(Mirror(face.normal, face.offset_m, span, (storey.bottom_m, top)))
     return found
 
 
-def _repeats(crossing: Crossing, chosen: Bool) -> bool | None:
-    """Say if most of the chosen readings repeat what is before the line, those of surfaces that face it if there are some; None for next to none."""
-    facing = chosen & (crossing.weight == 1.0)
-    if facing.sum() >= LEAST_FACING:
-        chosen = facing
-    every = float(crossing.weight[chosen].sum())
-    return float(crossing.weight[chosen & crossing.repeats].sum()) > LEAST_SHARE * every if every >= LEAST_WEIGHT else None
-
-
-def is_reflection(face: Face, span: tuple[float, float], heights: tuple[float, float], readings: UprightReadings) -> bool | None:
-    """Say if what is read through a part of a face is a mirror's: nobody walked through it, and most of it repeats what is before it; None where next
-    to nothing is read that would differ."""
+def reflection_evidence(
+    face: Face, span: tuple[float, float], heights: tuple[float, float], readings: UprightReadings, space: FreeSpace, storey: Storey
+) -> float:
+    """Return what the readings through a part of a face count for a mirror there, less than 0 against it; nobody walks through a mirror."""
     if _is_walked_through(face, span, readings.eyes):
-        return False
-    crossing = _crossing(readings, face, span)
-    return _repeats(crossing, np.asarray((crossing.height > heights[0]) & (crossing.height < heights[1]), np.bool_))
+        return -float("inf")
+    crossing = _crossing(readings, space, storey, face, span)
+    within = (crossing.height > heights[0]) & (crossing.height < heights[1])
+    return float(_together(*(each[within].sum() for each in crossing.parts)))
 
 
-def _crossing(readings: UprightReadings, face: Face, span: tuple[float, float]) -> Crossing:
-    """Compare the readings through a stretch of the line of a face with those before it and those from behind it. A wall square to the face is no
-    evidence unless the face reaches it: it may go on behind."""
+def _together(facing: F64, aside: F64) -> F64:
+    """Add the evidence of surfaces that face a line and of walls square to it. These err together, reading by reading: all of them decide once, and
+    not against a single reading of what faces the line."""
+    return facing + np.clip(aside, -LEAST_WEIGHT, LEAST_WEIGHT)
+
+
+def _crossing(readings: UprightReadings, space: FreeSpace, storey: Storey, face: Face, span: tuple[float, float]) -> Crossing:
+    """Compare the readings through a stretch of the line of a face, where that is not read itself, with what is known before it and behind it.
+
+    One speaks for a mirror if its reflection is read before the face; against it if it is read from behind the face too, or if rays pass where its
+    reflection is; neither if both or none is so. A wall square to the face is no evidence unless the face reaches it: it may go on behind."""
     points, normals, eyes, normal = readings.points, readings.normals, readings.eyes, face.normal
     off = matmul(points[:, :2], normal) - face.offset_m
     away = matmul(eyes[:, :2], normal) - face.offset_m
@@ -140,16 +152,28 @@ def _crossing(readings: UprightReadings, face: Face, span: tuple[float, float]) 
     along = (1.0 - share) * matmul(eyes[:, :2], face.along)[rows] + share * matmul(points[rays, :2], face.along)
     inside = (along > span[0]) & (along < span[1])
     rays, rows, share, along = rays[inside], rows[inside], share[inside], along[inside]
-    height, before = (1.0 - share) * eyes[rows, 2] + share * points[rays, 2], away[readings.rows] > 0.0
-    facing, through = matmul(normals[rays, :2], normal), points[rays]
-    reflected, turned = through.copy(), normals[rays].copy()
-    reflected[:, :2] -= 2.0 * off[rays, None] * normal
-    turned[:, :2] -= 2.0 * facing[:, None] * normal
-    repeats = _is_read(reflected, turned, readings, before & (off > 0.0)) & ~_is_read(through, normals[rays], readings, ~before)
-    column = np.floor((matmul(through[:, :2], face.along) - face.start_m) / CELL_M).astype(int)
+    height = (1.0 - share) * eyes[rows, 2] + share * points[rays, 2]
+    column, level = (np.floor(each).astype(int) for each in ((along - face.start_m) / CELL_M, (height - storey.bottom_m) / LEVEL_M))
+    read = face.count[np.clip(column, 0, len(face.count) - 1), np.clip(level, 0, LEVELS - 1)] >= LEAST_READINGS
+    inside = ~(read & (column >= 0) & (column < len(face.count)))
+    rays, along, height, before = rays[inside], along[inside], height[inside], away[readings.rows] > 0.0
+    facing = matmul(normals[rays, :2], normal)
+    column = np.floor((matmul(points[rays, :2], face.along) - face.start_m) / CELL_M).astype(int)
     reached = sliding_sum(np.pad(face.count.any(axis=1), REACH).astype(np.float64), np.ones(2 * REACH + 1)) > 0.0
     met = reached[np.clip(column + REACH, 0, len(reached) - 1)]
-    return Crossing(along, height, np.where(np.abs(facing) > FACING, 1.0, np.where(met, ASIDE_WEIGHT, 0.0)), repeats)
+    evidence, judged = np.zeros(len(rays)), np.nonzero((np.abs(facing) > FACING) | met)[0]
+    through, turned = points[rays[judged]], normals[rays[judged]]
+    real = _is_read(through, turned, readings, ~before)
+    reflected, turned = through.copy(), turned.copy()
+    reflected[:, :2] -= 2.0 * off[rays[judged], None] * normal
+    turned[:, :2] -= 2.0 * facing[judged, None] * normal
+    repeats = _is_read(reflected, turned, readings, before & (off > 0.0))
+    left = np.nonzero(~repeats & ~real)[0]
+    free = np.all([space.passed(reflected[left] + step * SAME_M * turned[left], storey.bottom_m) for step in range(-2, 3)], axis=0)
+    against = real & ~repeats
+    against[left[free]] = True
+    evidence[judged] = np.where(against, -1.0, np.where(repeats & ~real, 1.0, 0.0))
+    return Crossing(along, height, evidence, np.abs(facing) > FACING)
 
 
 def _is_walked_through(face: Face, span: tuple[float, float], eyes: F64) -> bool:
@@ -178,7 +202,7 @@ def _is_read(points: F64, normals: F64, readings: UprightReadings, chosen: Bool)
 
 def without_mirrors(evidence: Evidence, mirrors: list[Mirror]) -> Evidence:
     """Return the evidence with what mirrors show put where they are."""
-    points, normals, views = evidence.points.copy(), evidence.normals.copy(), list(evidence.views)
+    points, normals, information, views = evidence.points.copy(), evidence.normals.copy(), evidence.information.copy(), list(evidence.views)
     for mirror in mirrors:
         behind = np.nonzero(matmul(points[:, :2], mirror.normal) < mirror.offset_m)[0]
         rays = behind[(matmul(evidence.eyes[:, :2], mirror.normal) > mirror.offset_m)[evidence.rows[behind]]]
@@ -187,9 +211,10 @@ def without_mirrors(evidence: Evidence, mirrors: list[Mirror]) -> Evidence:
         turned = rays[inside]
         points[turned] = eyes[inside] + share[inside, None] * (points[turned] - eyes[inside])
         normals[turned] = [*mirror.normal, 0.0]
+        information[turned] *= MOVED
         for row in np.unique(evidence.rows[turned]):
             views[row] = _view_without(views[row], evidence.poses[row], mirror)
-    return replace(evidence, points=points, normals=normals, views=views)
+    return replace(evidence, points=points, normals=normals, information=information, views=views)
 
 
 def _view_without(view: KeyframeView, T: F64, mirror: Mirror) -> KeyframeView:

@@ -9,14 +9,14 @@ from numpy.typing import NDArray
 
 from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import F64, I32, Bool
-from trihedron.plugins.building.edges import FIT_M, Edge
+from trihedron.plugins.building.edges import FIT_M
 from trihedron.plugins.building.evidence import Evidence
 from trihedron.plugins.building.faces import Face
 from trihedron.plugins.building.free_space import CELL_M, LEVEL_M, FreeSpace
 from trihedron.plugins.building.free_space_kernels import LEVELS, U32
 from trihedron.plugins.building.jogs import WIDEST_DOOR_M, is_recess
 from trihedron.plugins.building.levels import Storey, sliding_sum
-from trihedron.plugins.building.mirrors import UprightReadings, is_reflection
+from trihedron.plugins.building.mirrors import LEAST_WEIGHT, UprightReadings, reflection_evidence
 from trihedron.plugins.building.rooms import RoomPlan, room_at
 from trihedron.plugins.building.walls import AROUND_M, WallPlan
 
@@ -54,16 +54,18 @@ def openings_of(
         marked = np.nonzero(_close_gaps(crossed))[0]
         for run in np.split(marked, np.nonzero(np.diff(marked) > 1)[0] + 1) if len(marked) else []:
             opening = _opening(number, wall, run, levels, evidence, storey, rooms, faces)
-            if opening is not None and not _is_mirror(opening, wall.edge, storey, readings):
+            if opening is not None and not _is_mirror(opening, wall, storey, space, readings):
                 found.append(opening)
     return found
 
 
-def _is_mirror(opening: OpeningPlan, edge: Edge, storey: Storey, readings: UprightReadings) -> bool:
-    """Say if an opening is a mirror, as it is taken for where little is read through it and there is a room on one side only."""
-    low, high = opening.heights
-    reflects = is_reflection(edge.face, opening.span, (storey.bottom_m + low, storey.bottom_m + high), readings) if edge.face else False
-    return min(opening.rooms) < 0 if reflects is None else reflects
+def _is_mirror(opening: OpeningPlan, wall: WallPlan, storey: Storey, space: FreeSpace, readings: UprightReadings) -> bool:
+    """Say if an opening is a mirror on either side of its wall, as it is taken for where nothing decides and there is a room on one side only."""
+    (a, b), (low, high), evidence = opening.span, opening.heights, 0.0
+    for face in {id(edge.face): edge.face for _, edge in wall.edges if edge.face is not None}.values():
+        span = (a, b) if matmul(face.normal, wall.edge.normal) > 0.0 else (-b, -a)
+        evidence += reflection_evidence(face, span, (storey.bottom_m + low, storey.bottom_m + high), readings, space, storey)
+    return evidence >= LEAST_WEIGHT or (evidence > -LEAST_WEIGHT and min(opening.rooms) < 0)
 
 
 def _close_gaps(columns: Bool) -> Bool:

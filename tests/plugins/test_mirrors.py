@@ -15,7 +15,11 @@ from trihedron.datasets.simulation.synthetic import Scene, Synthetic
 from trihedron.pipeline.core.types import OPENING_KINDS, Building, Camera
 from trihedron.plugins.building import layout, openings
 from trihedron.plugins.building.evidence import Evidence
-from trihedron.plugins.building.mirrors import Mirror, without_mirrors
+from trihedron.plugins.building.faces import Face
+from trihedron.plugins.building.free_space import FreeSpace
+from trihedron.plugins.building.free_space_kernels import LEVELS
+from trihedron.plugins.building.levels import Storey
+from trihedron.plugins.building.mirrors import LEAST_WEIGHT, Mirror, mirrors_of, reflection_evidence, upright_readings, without_mirrors
 from trihedron.plugins.shared.keyframe_views import KeyframeView
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -84,3 +88,67 @@ def test_a_ray_ends_at_the_mirror_that_turns_it_back() -> None:
     depth = np.full((3, 3), 4.0)
     depth[1, 1] = 2.0
     assert moved.views[0].depth_m == pytest.approx(depth) and evidence.views[0].depth_m.min() == 4.0
+
+
+def found_mirrors(inputs: list, monkeypatch: pytest.MonkeyPatch) -> tuple[Building, list[Mirror]]:
+    """Return the plan, and the mirrors that were found for it."""
+    found: list[Mirror] = []
+    monkeypatch.setattr(layout, "mirrors_of", lambda *inputs: found.extend(mirrors_of(*inputs)) or found)
+    return folded("manhattan_layout", inputs), found
+
+
+def test_the_mirrored_door_of_a_wardrobe_is_a_mirror(walk, monkeypatch: pytest.MonkeyPatch) -> None:
+    _, inputs = walk
+    plan, found = found_mirrors(inputs, monkeypatch)
+    doors = [pane for pane in glazed_flat(FLAT).room.panes if pane.kind is Glass.mirror and pane.size_m == pytest.approx((0.7, 1.85))]
+    to_building = np.linalg.inv(plan.T_world_building)
+    told = 0
+    for door in doors:
+        middle = door.origin + 0.5 * (door.size_m[0] * door.u + door.size_m[1] * door.v)
+        x, y = (to_building[:3, :3] @ middle + to_building[:3, 3])[:2]
+        told += any(
+            abs(np.dot(mirror.normal, [x, y]) - mirror.offset_m) < 0.1
+            and mirror.span[0] < x * mirror.normal[1] - y * mirror.normal[0] < mirror.span[1]
+            for mirror in found
+        )
+    assert told >= 1
+
+
+def test_a_furnished_flat_without_mirrors_has_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    dataset = Synthetic(scene=Scene.random_flat, flat=6, seed=6, fps=2.5, width=160, height=120, texture=False)
+    truth = dataset.truth()
+    frames = [dataset(k) for k in range(len(dataset))]
+    assert found_mirrors([(frame, planes_of(frame), pose_at(k, truth.poses[k])) for k, frame in enumerate(frames)], monkeypatch)[1] == []
+
+
+def told(*surfaces: tuple[int, tuple[float, float], float], free: bool = False) -> float:
+    """Return the evidence for a mirror on the line y = 0 that the first surface is read through, by view 0; surfaces have a view, where on the plan
+    they are, and where they look to in degrees, and are read 20 times."""
+    eyes = np.array([[0.0, 2.5, 1.2], [5.0, 2.5, 1.2], [5.0, -0.5, 1.2]])  # the last two walk round the end of the line
+    points = np.array([(x, y, 1.2) for _, (x, y), _ in surfaces for _ in range(80)])
+    normals = np.array([(np.cos(np.radians(angle)), np.sin(np.radians(angle)), 0.0) for *_, angle in surfaces for _ in range(80)])
+    poses = [np.eye(4) for _ in eyes]
+    for T, eye in zip(poses, eyes):
+        T[:3, 3] = eye
+    rows = np.repeat(np.array([view for view, *_ in surfaces], np.int32), 80)
+    evidence = Evidence(np.eye(4), [], poses, np.zeros((3, 3, 3)), points, normals, np.ones(len(points)), np.ones(len(points)), rows)
+    count = np.zeros((40, LEVELS), np.int32)
+    count[[0, 1, 38, 39], :25] = 5  # read at both ends
+    face = Face(np.array([0.0, 1.0]), 0.0, -1.0, count, np.zeros(40, np.bool_), np.zeros(0, np.int64))
+    levels = np.full((200, 200), 0xFFFFFFFF if free else 0, np.uint32)
+    space = FreeSpace(np.array([-5.0, -5.0]), levels, np.zeros((200, 200), np.bool_), np.zeros((200, 200), np.bool_))
+    storey = Storey(0.0, 2.6, 2.6)
+    return reflection_evidence(face, (-0.9, 0.9), (0.0, 2.0), upright_readings(evidence, storey), space, storey)
+
+
+def test_a_reading_is_evidence_for_a_mirror_against_one_or_neither() -> None:
+    behind, reflection, real = (0, (0.0, -2.0), 90.0), (1, (0.0, 2.0), -90.0), (2, (0.0, -2.0), 90.0)
+    assert told(behind, reflection) == 20.0
+    assert told(behind, real) == told(behind, free=True) == -20.0
+    assert told(behind) == told(behind, reflection, real) == 0.0
+
+
+def test_walls_square_to_a_mirror_decide_only_where_nothing_that_faces_it_speaks_against() -> None:
+    square, repeated = (0, (-0.95, -0.5), 0.0), (1, (-0.95, 0.5), 0.0)
+    assert told(square, repeated) == LEAST_WEIGHT
+    assert told(square, repeated, (0, (0.0, -2.0), 90.0), (2, (0.0, -2.0), 90.0)) < 0.0
