@@ -14,7 +14,7 @@ from trihedron.plugins.building.evidence import Evidence
 from trihedron.plugins.building.faces import Face
 from trihedron.plugins.building.free_space import CELL_M, LEVEL_M, FreeSpace
 from trihedron.plugins.building.free_space_kernels import LEVELS, U32
-from trihedron.plugins.building.jogs import WIDEST_DOOR_M, is_recess
+from trihedron.plugins.building.jogs import DEPTH_M, WIDEST_DOOR_M, is_recess
 from trihedron.plugins.building.levels import Storey, sliding_sum
 from trihedron.plugins.building.mirrors import LEAST_WEIGHT, UprightReadings, reflection_evidence
 from trihedron.plugins.building.rooms import RoomPlan, room_at
@@ -54,9 +54,20 @@ def openings_of(
         marked = np.nonzero(_close_gaps(crossed))[0]
         for run in np.split(marked, np.nonzero(np.diff(marked) > 1)[0] + 1) if len(marked) else []:
             opening = _opening(number, wall, run, levels, evidence, storey, rooms, faces)
-            if opening is not None and not _is_mirror(opening, wall, storey, space, readings):
+            if opening is not None and not is_niche(opening, wall, space) and not _is_mirror(opening, wall, storey, space, readings):
                 found.append(opening)
     return found
+
+
+def is_niche(opening: OpeningPlan, wall: WallPlan, space: FreeSpace) -> bool:
+    """Say if no ray gets farther behind an opening, on the side where there is no room, than into a niche, whose back need not have been read."""
+    front, back = opening.rooms
+    if min(front, back) >= 0:
+        return False
+    thickness = wall.thickness_m if np.isfinite(wall.thickness_m) else 0.0
+    off = -(thickness + DEPTH_M[1]) if back < 0 else DEPTH_M[1]
+    along = np.arange(opening.span[0], opening.span[1], CELL_M / 2.0)
+    return not space.at(along[:, None] * wall.edge.along + (wall.edge.offset_m + off) * wall.edge.normal).any()
 
 
 def _is_mirror(opening: OpeningPlan, wall: WallPlan, storey: Storey, space: FreeSpace, readings: UprightReadings) -> bool:

@@ -26,14 +26,15 @@ from trihedron.plugins.building.edges import Edge, end_at_readings, intersect_ed
 from trihedron.plugins.building.evidence import Evidence
 from trihedron.plugins.building.faces import Face
 from trihedron.plugins.building.files import building_json, summary, write_building
-from trihedron.plugins.building.free_space import FreeSpace
+from trihedron.plugins.building.free_space import CELL_M, FreeSpace
 from trihedron.plugins.building.free_space_kernels import LEVELS
 from trihedron.plugins.building.geometry import wall_pieces
 from trihedron.plugins.building.ifc import has_ifc, write_ifc
 from trihedron.plugins.building.jogs import jog_sides, parting_columns
-from trihedron.plugins.building.openings import fit_jambs, widest_gap
+from trihedron.plugins.building.openings import OpeningPlan, fit_jambs, is_niche, widest_gap
 from trihedron.plugins.building.svg import floorplan_svg
 from trihedron.plugins.building.tall_furniture import Stretch, wall_prior, wall_probability
+from trihedron.plugins.building.walls import WallPlan
 from trihedron.plugins.mapping.insertion import add_keyframe
 from trihedron.plugins.mapping.landmarks import empty_map
 from trihedron.plugins.normals.integral_image import IntegralImage
@@ -342,6 +343,19 @@ def test_what_no_view_shows_within_a_room_is_inside_and_within_a_wall_is_not():
     more = [*edges, (0, 5, 0.0, 1.0), (2, 5, 0.0, 1.0)]
     unseen = Cells([*polygons, shapely.box(4, 0, 7, 2)], np.append(free, 0.2), more, np.append(in_wall, False))
     assert not inside_cells(unseen)[5]  # nobody overlooks 6 m² of a room
+
+
+@pytest.mark.parametrize(("rooms", "passed", "niche"), [((0, -1), -0.5, True), ((0, -1), -1.5, False), ((-1, 0), 1.5, False), ((0, 1), -0.5, False)])
+def test_what_no_ray_goes_on_behind_is_a_niche(rooms, passed, niche):
+    """A wall 10 cm thick along the x axis, with a stretch from 1 m to 2 m that rays cross as far as `passed` m in y."""
+    levels = np.zeros((80, 80), np.uint32)
+    low, high = sorted(round((2.0 + y) / CELL_M) for y in (0.0, passed))
+    levels[low:high, 20:40] = 1  # the origin is at (0, -2)
+    space = FreeSpace(np.array([0.0, -2.0]), levels, np.zeros((80, 80), np.bool_), np.zeros((80, 80), np.bool_))
+    edge = Edge(np.array([0.0, 1.0]), 0.0, None, np.array([0.0, 0.0]), np.array([4.0, 0.0]))
+    wall = WallPlan(edge, (0.0, 4.0), 0.1, 0.01, [])
+    opening = OpeningPlan(0, (1.0, 2.0), (0.0, 2.0), (0.01,) * 4, "passage", rooms, np.empty(0, np.int32))
+    assert is_niche(opening, wall, space) is niche
 
 
 def test_a_benchmark_that_was_stopped_goes_on(tmp_path, monkeypatch):
