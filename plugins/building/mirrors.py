@@ -24,7 +24,7 @@ NEIGHBOURS = (0, 1 << 42, -(1 << 42), 1 << 22, -(1 << 22), 4, -4)  # steps of ke
 REACH = 3  # columns, of a face to the wall square to it that it reaches
 BROAD, LEAST_WEIGHT = 3, 4.0  # neighbouring columns of a face that are judged together, the evidence that decides
 MOVED = 1e-4  # of the information of a reading that is put onto a mirror, which does not say where that is
-NARROWEST_M, RIM_M = 0.15, 0.05
+NARROWEST_M, RIM_M = 0.25, 0.05
 ASIDE_M = 0.4  # from the way of the camera to the jamb of what it goes through
 LEAST_FACE_M, WIDEST_M = 0.2, 1.2  # of a face that is read, of a gap in it and of what is beside it
 
