@@ -17,7 +17,8 @@ from trihedron.plugins.building.levels import LEAST_FLOOR_M2, lowest_floor
 from trihedron.plugins.shared.keyframe_views import KeyframeView, view_of
 
 STRIDE = 2  # px of a view, between planar points
-MOVED_M, TURNED_DEG = 0.25, 15.0  # since the last view that was kept, after which another is
+MOVED_M, TURNED_DEG = 0.25, 15.0  # between views that a plan is made of
+LEAST_VIEWS = 40  # for which nearer ones are taken: a short walk has no others
 PREVIEW_VIEWS = 60
 
 
@@ -56,7 +57,7 @@ def empty_state(options: LayoutOptions) -> BuildingState:
 def add_view(
     options: LayoutOptions, state: BuildingState, frame: Frame, planes: Planes, rotation: Rotation | None, pose: Pose, map: Map | None
 ) -> BuildingState:  # fmt: skip
-    """Retain the frame if it became a keyframe, or without a map, and the camera has moved since the last. Other frames cost next to nothing."""
+    """Retain the frame if it became a keyframe; without a map, if the camera has moved since the last. Other frames cost next to nothing."""
     state.index, state.stamp_ns, state.map = frame.index, frame.stamp_ns, map
     if rotation is not None and len(rotation.weights):
         state.axes = rotation.R_world_manhattan[int(np.argmax(rotation.weights))]
@@ -68,18 +69,18 @@ def add_view(
         newest, state.keyframes = len(map.keyframes), max(state.keyframes, len(map.keyframes))
         wanted = newest > 0 and int(map.keyframes.rows("index", np.array([newest - 1]))[0]) == frame.index
     else:
-        wanted = state.keyframes == 0
-    if wanted and (not state.views or has_moved(state.views[-1].T_world_camera, pose.T_world_camera)):
+        wanted = state.keyframes == 0 and (not state.views or has_moved(state.views[-1].T_world_camera, pose.T_world_camera))
+    if wanted:
         view = view_of(frame, planes, pose, map, options.view_width, options.max_sigma_m)
         state.views.append(replace(view, color=view.color[:0, :0].copy()))
         state.covariances.append(pose.covariance)
     return state
 
 
-def has_moved(before: F64, now: F64) -> bool:
-    """Say if a pose (4, 4) is far enough from another to be kept."""
+def has_moved(before: F64, now: F64, apart: float = 1.0) -> bool:
+    """Say if a pose (4, 4) is far enough from another: by that part of MOVED_M or TURNED_DEG."""
     turned = np.arccos(np.clip((np.trace(matmul(before[:3, :3].T, now[:3, :3])) - 1.0) / 2.0, -1.0, 1.0))
-    return bool(norm(now[:3, 3] - before[:3, 3]) > MOVED_M or turned > np.radians(TURNED_DEG))
+    return bool(norm(now[:3, 3] - before[:3, 3]) > apart * MOVED_M or turned > apart * np.radians(TURNED_DEG))
 
 
 def preview_state(state: BuildingState) -> BuildingState:
@@ -88,9 +89,23 @@ def preview_state(state: BuildingState) -> BuildingState:
     return replace(state, views=state.views[::every])
 
 
+def spread_views(state: BuildingState) -> list[tuple[KeyframeView, F64]]:
+    """Choose the views that a plan is made of, with their covariances: those that are MOVED_M or TURNED_DEG apart, as a keyframe every few frames
+    adds time and no knowledge; where these are fewer than LEAST_VIEWS, half as far apart, a quarter, or all."""
+    chosen: list[tuple[KeyframeView, F64]] = []
+    for apart in (1.0, 0.5, 0.25, 0.0):
+        chosen = []
+        for view, covariance in zip(state.views, state.covariances):
+            if not chosen or has_moved(chosen[-1][0].T_world_camera, view.T_world_camera, apart):
+                chosen.append((view, covariance))
+        if len(chosen) >= LEAST_VIEWS:
+            break
+    return chosen
+
+
 def gather_evidence(state: BuildingState, map: Map | None) -> Evidence | None:
-    """Gather the planar points of all views at their final poses; None when no view shows a plane."""
-    kept = [(view, T, C) for view, C in zip(state.views, state.covariances) if (T := view.final_pose(map)) is not None]
+    """Gather the planar points of views at their final poses; None when no view shows a plane."""
+    kept = [(view, T, C) for view, C in spread_views(state) if (T := view.final_pose(map)) is not None]
     if not kept:
         return None
     views, regions = [(view, T) for view, T, _ in kept], [_regions(view) for view, *_ in kept]

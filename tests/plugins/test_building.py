@@ -34,6 +34,7 @@ from trihedron.plugins.building.jogs import jog_sides, parting_columns
 from trihedron.plugins.building.openings import OpeningPlan, fit_jambs, is_niche, widest_gap
 from trihedron.plugins.building.svg import floorplan_svg
 from trihedron.plugins.building.tall_furniture import Stretch, wall_prior, wall_probability
+from trihedron.plugins.building.views import spread_views
 from trihedron.plugins.building.walls import WallPlan
 from trihedron.plugins.mapping.insertion import add_keyframe
 from trihedron.plugins.mapping.landmarks import empty_map
@@ -399,17 +400,20 @@ def test_a_preview_is_a_plan_of_some_views(walk, offices):
     assert len(preview.areas_m2) == 3 and preview.areas_m2.sum() == pytest.approx(offices["manhattan_layout"].areas_m2.sum(), rel=0.05)
 
 
-def test_a_keyframe_is_kept_when_the_camera_has_moved(walk):
-    """Three keyframes at each of two places that are 30 cm apart, and a frame between that is none."""
+def test_a_plan_is_made_of_views_that_are_apart(walk):
+    """Keyframes every 5 cm: of 300 those that are 25 cm apart; of 100 a quarter of that, 7 cm at least; of fewer all."""
     plugin, (frame, planes, pose) = plugin_class("building", "manhattan_layout")(), walk[1][0]
     state, map = plugin.start(), empty_map(0, 0, 32, 32, 16)
-    for index, (away_m, keyframe) in enumerate([(0.0, True)] * 3 + [(0.3, False)] + [(0.3, True)] * 3):
+    for index in range(300):
         T = pose.T_world_camera.copy()
-        T[:3, 3] += away_m * T[:3, 2]
-        here = pose_at(index, T)
-        map = add_keyframe(map, here, frame.camera)[0] if keyframe else map
-        state = plugin.add(state, replace(frame, index=index), planes, None, here, map)
-    assert [view.index for view in state.views] == [0, 4]
+        T[0, 3] += 0.05001 * index
+        map = add_keyframe(map, pose_at(index, T), frame.camera)[0]
+        state = plugin.add(state, replace(frame, index=index), planes, None, pose_at(index, T), map)
+    counts = {}
+    for count in (300, 100, 50, 20):
+        some = replace(state, views=state.views[:count], covariances=state.covariances[:count])
+        counts[count] = [view.index for view, _ in spread_views(some)][:3]
+    assert len(state.views) == 300 and counts == {300: [0, 5, 10], 100: [0, 2, 4], 50: [0, 1, 2], 20: [0, 1, 2]}
 
 
 @pytest.mark.slow
