@@ -9,12 +9,11 @@ import yaml
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
-from trihedron.pipeline.core.config import graph_of
+from trihedron.pipeline.core.config import graph_of, reason_of
 from trihedron.pipeline.core.errors import ConfigError, did_you_mean
 from trihedron.pipeline.core.graph import Graph, Stage
 from trihedron.pipeline.core.plugin_configs import PLUGIN_KEY
 from trihedron.pipeline.core.registry import plugin_class
-from trihedron.pipeline.core.slots import SLOTS
 from trihedron.pipeline.run.budget import Budget
 
 PLACE = "budget_order"
@@ -42,10 +41,11 @@ def budget_of(config: DictConfig, graph: Graph) -> Budget | None:
 
 def _fits(config: DictConfig, graph: Graph, word: str) -> bool:
     """Say if a word of the usual order saves something of a graph."""
-    slot, option, value = WORD.fullmatch(word).groups()  # type: ignore[union-attr]
+    key, _, value = word.partition("=")
+    slot, _, option = key.partition(".")
     if slot not in graph.stages:
         return False
-    return bool(config[slot][PLUGIN_KEY] != value if option is None else config[slot].get(option, 0) > int(value))
+    return bool(config[slot].get(option, 0) > int(value) if option else config[slot][PLUGIN_KEY] != value)
 
 
 def _changed_stage(config: DictConfig, graph: Graph, word: str) -> Stage:
@@ -56,7 +56,7 @@ def _changed_stage(config: DictConfig, graph: Graph, word: str) -> Stage:
     slot, option, value = match.groups()
     if slot not in graph.stages or graph.stages[slot].fold or slot == "dataset":
         known = [name for name, stage in graph.stages.items() if not stage.fold and name != "dataset"]
-        cause = "cannot be changed in mid-run" if slot in SLOTS and slot in graph.stages else "is no stage of this graph"
+        cause = "cannot be changed in mid-run" if slot in graph.stages else "is no stage of this graph"
         raise ConfigError(PLACE, f"{word}: '{slot}' {cause}", did_you_mean(slot, known))
     with open_dict(config):
         if option is None:
@@ -79,5 +79,4 @@ def _set_option(config: DictConfig, slot: str, option: str, value: str, word: st
     try:
         config[slot][option] = yaml.safe_load(value)
     except OmegaConfBaseException as error:
-        cause = " ".join(str(getattr(error, "msg", None) or error).split()).partition(" full_key")[0]
-        raise ConfigError(PLACE, f"{word}: {cause}", f"see trihedron plugins {slot} {name}") from error
+        raise ConfigError(PLACE, f"{word}: {reason_of(error)}", f"see trihedron plugins {slot} {name}") from error

@@ -46,7 +46,7 @@ from trihedron.pipeline.run.runner import Runner, Step
 from trihedron.pipeline.run.state import DelayLines, max_delays
 from trihedron.pipeline.run.stated_sigma import sigma_line
 from trihedron.pipeline.run.timing import forget_peak
-from trihedron.pipeline.run.warm_up import compilation_reported, warm_up
+from trihedron.pipeline.run.warm_up import compilation_reported, warm_up_budgeted
 
 RECORDING = "run.mcap"
 NETWORKS = tuple(f"{slot}.model" for slot in SLOTS)  # files of networks, of the plugins that run one
@@ -89,9 +89,7 @@ def _execute(config: DictConfig, out: Path, overrides: list[str], began: float, 
         compile_once(runner.computed, runner.count if runner.feed is None else None)
         write_configuration(out, config, overrides)
         with Warnings() as warnings, compilation_reported():
-            warm_up(trial())
-            for changed in budget.each() if budget is not None and replay is None else ():
-                warm_up(trial(budget=changed))
+            warm_up_budgeted(trial, budget if replay is None else None)
             warnings.muted = False
             metadata = {**metadata_of(config, overrides), TOPICS: json.dumps(sorted(topics))}
             attachments = _attachments(graph, replay)
@@ -287,8 +285,8 @@ def write_files(
     timing = runner.timing.summary(runner.threads, time.perf_counter() - started, started - began)
     if runner.feed is not None:
         timing["live"] = runner.feed.summary(timing["frame_ms"])
-    if runner.effort is not None:
-        timing["budget"] = runner.effort.summary()
+    if runner.budgeted is not None:
+        timing["budget"] = runner.budgeted.summary()
     try:
         if "pose" in runner.computed:
             result = results.with_unpacked_poses(runner.result)

@@ -313,11 +313,16 @@ def _wrong_type(error: ValidationError, text: str) -> ConfigError:
     elif kind in KINDS:
         permitted = KINDS[kind] + (f" that is {constraints}" if constraints else "")
     else:
-        return ConfigError(key, " ".join(str(error.msg or error).split()).partition(" full_key")[0], "give a value of that type")
+        return ConfigError(key, reason_of(error), "give a value of that type")
     default = next(option.default for option in dataclasses.fields(owner) if option.name == error.key)
     shown = default.name if isinstance(default, Enum) else str(default).lower() if isinstance(default, bool) else default
     given = "null" if error.value is None else error.value
     return ConfigError(key, f"'{given}' is not {permitted} (default {shown})", cure)
+
+
+def reason_of(error: BaseException) -> str:
+    """Return why OmegaConf refuses a value, in one line without the place."""
+    return " ".join(str(getattr(error, "msg", None) or error).split()).partition(" full_key")[0]
 
 
 def _unknown_option(group: str, name: str, options: list[str]) -> TrihedronError:

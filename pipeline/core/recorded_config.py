@@ -14,7 +14,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from trihedron.pipeline.core.config import RecordedConfig, RunOptions, make_plugin
+from trihedron.pipeline.core.config import RecordedConfig, RunOptions, make_plugin, reason_of
 from trihedron.pipeline.core.errors import RecordingError, TrihedronError
 from trihedron.pipeline.core.files import YamlError, parse_yaml
 from trihedron.pipeline.core.overrides import literal_text
@@ -95,8 +95,7 @@ def _convert_value(node: DictConfig, key: Any, value: Any, name: str, place: str
         node.merge_with({key: _literal(value)})
         plain: Any = OmegaConf.to_container(node, resolve=False)
     except (OmegaConfBaseException, ValueError, TypeError, OverflowError) as error:
-        cause = " ".join(str(getattr(error, "msg", None) or error).split()).partition(" full_key")[0]
-        raise RecordingError(place, f"was made with {name}={_abbreviate(value)}: {_abbreviate(cause, 4 * SHOWN)}", CURE) from error
+        raise RecordingError(place, f"was made with {name}={_abbreviate(value)}: {_abbreviate(reason_of(error), 4 * SHOWN)}", CURE) from error
     return plain[key]
 
 

@@ -53,8 +53,8 @@ class Decisions(Protocol):
 
 
 class Governor:
-    """Decides by the latency: one more word holds where its mean over WINDOW frames exceeds the budget. A word is given back after a while if what it
-    saved, when it was taken, would fit into the budget again."""
+    """Decides by the latency: one more word holds where its mean over WINDOW frames exceeds the budget. The last one is dropped after a while if what
+    it saved, when it was taken, would fit into the budget again."""
 
     def __init__(self, budget: Budget) -> None:
         self._budget, self._now = budget, budget.first
@@ -118,8 +118,8 @@ class RecordedDecisions:
         return self._levels.get(index, 0)
 
 
-class Effort:
-    """The effort of a run: which stages are called at each frame, and the count of frames by the number of words."""
+class BudgetedStages:
+    """The stages that are called at each frame to keep a budget, and the count of frames by the number of words."""
 
     def __init__(self, budget: Budget, decisions: Decisions) -> None:
         self.budget, self._decisions = budget, decisions

@@ -17,18 +17,17 @@ from typing import Any
 
 import numpy as np
 
-from trihedron.pipeline.core import types
 from trihedron.pipeline.core.errors import StageError, TrihedronError
 from trihedron.pipeline.core.graph import Graph, Stage
 from trihedron.pipeline.core.registry import check_value
 from trihedron.pipeline.core.slots import CAMERA, RNG
-from trihedron.pipeline.core.types import Frame, Map, Pose, Trajectory, Value
+from trihedron.pipeline.core.types import Effort, Frame, Map, Pose, Trajectory, Value
 from trihedron.pipeline.core.value_checks import check_together
 from trihedron.pipeline.core.wires import Wire
 from trihedron.pipeline.record.reader import TopicReader
 from trihedron.pipeline.record.writer import RecordingWriter
 from trihedron.pipeline.run.accounting import Accounting
-from trihedron.pipeline.run.budget import EFFORT_TOPIC, Budget, Decisions, Effort, Governor, RecordedDecisions
+from trihedron.pipeline.run.budget import EFFORT_TOPIC, Budget, BudgetedStages, Decisions, Governor, RecordedDecisions
 from trihedron.pipeline.run.frame_validation import FrameValidation
 from trihedron.pipeline.run.interrupts import Interrupts
 from trihedron.pipeline.run.live import Pace, feed_of
@@ -93,7 +92,7 @@ class Runner:
         self.validation = FrameValidation(self.plan.stamps_ns, self.count if self.feed is None else 0)
         self._time_offset = TimeOffsetCheck()
         self._sources = str(replay.recording.path) if replay is not None else "load_map" if self.initial.held else ""  # files of inputs
-        self.effort = Effort(budget, self._decisions(budget)) if budget is not None else None
+        self.budgeted = BudgetedStages(budget, self._decisions(budget)) if budget is not None else None
         self._fold_states: dict[str, Any] = {}
         self._preview_period = preview_period
         self._previews: deque[tuple[str, Value]] = deque()
@@ -148,9 +147,9 @@ class Runner:
         self.state.append(index, values)
         if accounts.take(position, index, values, self.count, position in self.validation.late):
             self._judge_time_offset(values.get("dataset"), values.get("pose"))
-            if self.effort is not None:
-                level = self.effort.take(position, index, accounts.times[position].latency_ms or 0.0)
-                values = {**values, EFFORT_TOPIC: types.Effort(index, accounts.stamps_ns[index], level)}
+            if self.budgeted is not None:
+                level = self.budgeted.take(position, index, accounts.times[position].latency_ms or 0.0)
+                values = {**values, EFFORT_TOPIC: Effort(index, accounts.stamps_ns[index], level)}
             for sink in self.sinks:
                 sink.frame(index, accounts.stamps_ns[index], values, accounts.times[position])
             while self._previews:
@@ -220,7 +219,7 @@ class Runner:
 
     def _call(self, stage: Stage, position: int, values: Mapping[str, Any]) -> Value | None:
         """Skip, seed, time and check one call."""
-        if self.effort is not None and (changed := self.effort.stage(stage, position)) is not stage:
+        if self.budgeted is not None and (changed := self.budgeted.stage(stage, position)) is not stage:
             stage, values = changed, {parameter: values[parameter] for parameter in changed.inputs}
         if any(values[parameter] is None for parameter in stage.required):
             return None

@@ -15,6 +15,7 @@ from tqdm import tqdm
 
 from trihedron.pipeline.core.errors import TrihedronError
 from trihedron.pipeline.core.machine_code import carried, why_unused
+from trihedron.pipeline.run.budget import Budget
 from trihedron.pipeline.run.memory import malloc_trim
 from trihedron.pipeline.run.runner import Runner
 
@@ -137,7 +138,7 @@ def warm_up(runner: Runner) -> None:
     """Call every stage on the first frames and discard the results, unless this process has done so for all of them; an error here is left to the
     run itself, which reports it."""
     called = {name: runner.graph.stages[name] for name in runner.computed}
-    called |= {name: runner.effort.stage(stage, 0) for name, stage in called.items()} if runner.effort is not None else {}
+    called |= {name: runner.budgeted.stage(stage, 0) for name, stage in called.items()} if runner.budgeted is not None else {}
     plugins = {name: stage.plugin for name, stage in called.items()}
     stages = {f"{name}={type(plugin) if name == 'dataset' else plugin!r}" for name, plugin in plugins.items()}
     if stages <= _WARM:
@@ -148,3 +149,10 @@ def warm_up(runner: Runner) -> None:
             pass
         _WARM.update(stages)
     malloc_trim()  # the data set's and the compiler's memory: frames would grow into it, unseen in the memory that the run reports
+
+
+def warm_up_budgeted(trial: Callable[..., Runner], budget: Budget | None) -> None:
+    """Warm up the runner that `trial` makes, and those in which one word of the budget holds, two, and so on (`trial(budget=...)`)."""
+    warm_up(trial())
+    for changed in budget.each() if budget is not None else ():
+        warm_up(trial(budget=changed))

@@ -88,8 +88,8 @@ def upright_readings(evidence: Evidence, storey: Storey) -> UprightReadings:
 
 
 def mirrors_of(faces: list[Face], readings: UprightReadings, space: FreeSpace, storey: Storey) -> list[Mirror]:
-    """Find the stretches of faces, high or not, and of their lines beside them, through which most readings that tell repeat what is before the face,
-    and that nobody walked through."""
+    """Find the stretches of faces, high or not, and of their lines beside them, through which most readings that decide repeat what is before the
+    face, and that nobody walked through."""
     found: list[Mirror] = []
     wide = round(WIDEST_M / CELL_M)
     for face in faces:

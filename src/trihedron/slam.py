@@ -38,12 +38,13 @@ from trihedron.pipeline.record.mcap_writer import new_recording
 from trihedron.pipeline.record.rescue import recover
 from trihedron.pipeline.record.writer import RecordingWriter
 from trihedron.pipeline.run import results
+from trihedron.pipeline.run.budget import EFFORT_TOPIC, Budget
 from trihedron.pipeline.run.map_file import save_map
 from trihedron.pipeline.run.replay import TOPICS
 from trihedron.pipeline.run.run_folder import lock_folder, write_configuration
 from trihedron.pipeline.run.runner import Runner, Step
 from trihedron.pipeline.run.sinks import MemorySink, Sink
-from trihedron.pipeline.run.warm_up import WARM_UP_FRAMES, compilation_reported, warm_up
+from trihedron.pipeline.run.warm_up import WARM_UP_FRAMES, compilation_reported, warm_up_budgeted
 from trihedron.trajectory import Trajectory
 from trihedron.words import words_of
 
@@ -125,7 +126,7 @@ class Slam:
         self._failure: BaseException | None = None
         self._ended = self._closed = False
         self._topics = recorded_topics(self._config, graph, None)
-        self._memory = MemorySink(max(history, 1) if out is None else 1, {"dataset"} | self._topics)
+        self._memory = MemorySink(max(history, 1) if out is None else 1, {"dataset", EFFORT_TOPIC} | self._topics)
         self._stack = ExitStack()
         self._writer: RecordingWriter | None = None
         self._out = Path(out).expanduser().absolute() if out is not None else None
@@ -136,7 +137,7 @@ class Slam:
                 graph, self._config.seed, self._config.threads, None, "", initial, on_value=self._note, preview_period=period, budget=budget
             )  # fmt: skip
             self._sinks: tuple[Sink, ...] = (self._memory, *viewer.sinks)
-            self._open(graph, viewer)
+            self._open(graph, viewer, budget)
         except BaseException:
             self._stack.close()
             raise
@@ -145,7 +146,7 @@ class Slam:
         self._thread.start()
         atexit.register(self.close)
 
-    def _open(self, graph: Graph, viewer: Viewer) -> None:
+    def _open(self, graph: Graph, viewer: Viewer, budget: Budget | None) -> None:
         """Open the run folder and its recording, then compile and load what the first frames need."""
         if self._out is not None:
             self._stack.enter_context(lock_folder(self._out))
@@ -153,7 +154,7 @@ class Slam:
             write_configuration(self._out, self._config, self._words)
         compile_once(self._runner.computed, None)
         with compilation_reported():
-            warm_up(Runner(_on_synthetic_images(graph, self.camera), self._config.seed, self._config.threads))
+            warm_up_budgeted(functools.partial(Runner, _on_synthetic_images(graph, self.camera), self._config.seed, self._config.threads), budget)
         if self._out is not None or viewer.server is not None:
             file = self._out / RECORDING if self._out is not None else None
             self._writer = RecordingWriter(file, self._metadata(), viewer.server)

@@ -65,12 +65,12 @@ def driven(governor: Governor, latency_ms: tuple[float, ...], count: int, start:
     return [fed(governor, latency_ms[governor.level(position)], 1, position)[0] for position in range(start, start + count)]
 
 
-def test_a_word_is_given_back_when_what_it_saved_would_fit() -> None:
-    """A word that takes 30 ms to 18 is given back below 12 ms, the budget of 20 over 30 / 18; the next time after twice as many frames."""
+def test_a_word_is_dropped_when_what_it_saved_would_fit() -> None:
+    """A word that takes 30 ms to 18 is dropped below 12 ms, the budget of 20 over 30 / 18; the next time after twice as many frames."""
     governor, heavy, light = Governor(Budget(20.0, WORDS, ())), (30.0, 18.0), (18.0, 11.0)
     assert driven(governor, heavy, 500, 0) == WINDOW * [0] + (500 - WINDOW) * [1]
-    given_back = driven(governor, light, 100, 500)
-    assert sum(given_back) <= WINDOW and given_back == sorted(given_back, reverse=True)
+    dropped = driven(governor, light, 100, 500)
+    assert sum(dropped) <= WINDOW and dropped == sorted(dropped, reverse=True)
     taken = driven(governor, heavy, WINDOW, 600)
     assert taken == sorted(taken) and taken[-1] == 1
     assert sum(driven(governor, light, 500, 700)) in range(2 * PATIENCE - WINDOW, 2 * PATIENCE + 1)
@@ -111,15 +111,15 @@ def test_a_replay_repeats_the_decisions(tmp_path: Path, threads: int) -> None:
     assert levels == sorted(levels) and WINDOW <= levels.count(0) < 60 and len(levels) == 60
     empty = [value.index for value in Recording(tmp_path / "run.mcap").values("keypoints") if not len(value.pixels)]
     assert set(empty) == {0} | {k for k in range(60) if levels[k]}
-    assert ran.effort is not None and ran.effort.summary() == {"ms": 1e-6, "words": ["keypoints=other"], "frames": [levels.count(0), levels.count(1)]}
+    counts = [levels.count(0), levels.count(1)]
+    assert ran.budgeted is not None and ran.budgeted.summary() == {"ms": 1e-6, "words": ["keypoints=other"], "frames": counts}
     for only in (("keypoints", "rotation"), ("rotation", "pose")):
         replay = Replay(Recording(tmp_path / "run.mcap"), only)
         again = run(tmp_path / "again.mcap", threads=4 - threads, replay=replay, budget=toy_budget(33.0))
         before, after = contents(tmp_path / "run.mcap"), contents(tmp_path / "again.mcap")
-        assert {topic: before[topic] == after[topic] for topic in after} == dict.fromkeys(after, True) and {"/effort", "/pose"} <= set(after) | {
-            "/pose"
-        }
-        assert again.effort is not None and again.effort.summary()["frames"] == [levels.count(0), levels.count(1)]
+        assert {topic: before[topic] == after[topic] for topic in after} == dict.fromkeys(after, True)
+        assert {"/effort", *(f"/{name}" for name in only)} <= set(after)
+        assert again.budgeted is not None and again.budgeted.summary()["frames"] == counts
 
 
 def test_within_the_budget_the_bytes_are_those_without_one(tmp_path: Path) -> None:
@@ -220,6 +220,16 @@ def test_pushed_frames_have_a_budget_too(tmp_path: Path) -> None:
             slam.track(room(k).color, room(k).depth_m, 0.1 * (k + 1))
     assert Recording(tmp_path / "run" / "run.mcap").value("effort", int(2.4e9)) is not None
     assert json.loads((tmp_path / "run" / "timing.json").read_text())["budget"]["words"] == ["bundle=none"]
+
+
+def test_what_is_saved_of_pushed_frames_has_the_decisions(tmp_path: Path) -> None:
+    room = Synthetic(length=14, width=160, height=120)
+    with th.Slam(room(0).camera, "budget_ms=0.001", "budget_order=[bundle=none]", history=5) as slam:
+        for k in range(14):
+            slam.track(room(k).color, room(k).depth_m, 0.1 * (k + 1))
+        slam.save(tmp_path / "last.mcap")
+    recording = Recording(tmp_path / "last.mcap")
+    assert [value.index for value in recording.values("effort")] == [value.index for value in recording.references] == list(range(9, 14))
 
 
 @pytest.mark.slow
