@@ -38,12 +38,12 @@ class StoreyPlan:
 
 @dataclass(frozen=True)
 class MapPlanes:
-    """Planes of a map in the building's frame: ids (p,), normals (p, 3), offsets (p,) and samples (p, s, 3), NaN where there are fewer."""
+    """Planes of a map in the building's frame: ids (p,), normals (p, 3), offsets (p,) and the samples (s, 3) of each."""
 
     ids: I64
     normals: F64
     offsets_m: F64
-    samples_m: F64
+    samples_m: list[F64]
 
 
 def assemble_building(state: BuildingState, evidence: Evidence, plans: list[StoreyPlan], map: Map | None) -> Building:
@@ -182,7 +182,7 @@ def _planes_of_wall(wall: WallPlan, known: MapPlanes) -> list[int]:
     edge, depth, found = wall.edge, wall.thickness_m, []
     facing = matmul(known.normals[:, :2], edge.normal)
     for row in np.nonzero(np.abs(facing) > 0.995)[0]:
-        seen = known.samples_m[row][np.isfinite(known.samples_m[row]).all(axis=1)]
+        seen = known.samples_m[row]
         if len(seen) == 0:
             continue
         off, t = matmul(seen[:, :2], edge.normal) - edge.offset_m, matmul(seen[:, :2], edge.along)
@@ -207,12 +207,13 @@ def _level_support(storey: Storey, evidence: Evidence, known: MapPlanes) -> tupl
 def _map_planes(evidence: Evidence, map: Map | None) -> MapPlanes:
     """Return the map's living planes in the building's frame."""
     if map is None or len(map.planes) == 0:
-        return MapPlanes(np.empty(0, np.int64), np.empty((0, 3)), np.empty(0), np.empty((0, 0, 3)))
+        return MapPlanes(np.empty(0, np.int64), np.empty((0, 3)), np.empty(0), [])
     ids = np.nonzero(map.planes.rows("alive", np.arange(len(map.planes))))[0]
     R, t = evidence.T_world_building[:3, :3], evidence.T_world_building[:3, 3]
     coefficients = map.planes.rows("coefficients", ids)
-    samples = np.asarray(map.planes.rows("samples_m", ids), np.float64)
-    return MapPlanes(ids, matmul(coefficients[:, :3], R), coefficients[:, 3] + matmul(coefficients[:, :3], t), matmul(samples - t, R))
+    samples = matmul(np.asarray(map.planes.rows("samples_m", ids), np.float64) - t, R)
+    taken = [each[finite] for each, finite in zip(samples, np.isfinite(samples).all(axis=2))]  # NaN where a plane has fewer
+    return MapPlanes(ids, matmul(coefficients[:, :3], R), coefficients[:, 3] + matmul(coefficients[:, :3], t), taken)
 
 
 def _furniture(known: MapPlanes, used: set[int], plans: list[StoreyPlan]) -> I32:

@@ -8,13 +8,12 @@ from typing import Any
 import numpy as np
 
 from trihedron.pipeline.core.linalg import det, matmul, norm, solve
-from trihedron.pipeline.core.types import F64, I32
+from trihedron.pipeline.core.types import F64, I32, Bool
 from trihedron.plugins.building.cell_complex import TALL_SHARE
 from trihedron.plugins.building.evidence import SCALE, Evidence, drift_variance, mean_over_views
 from trihedron.plugins.building.faces import Face, tall_m
 from trihedron.plugins.building.free_space import CELL_M
 from trihedron.plugins.building.levels import Storey
-from trihedron.plugins.shared.voxel_hash_kernels import I64
 
 ON_WALL_SHARE = 0.3  # of a room's edge, for which it is a wall
 SAME_LINE_M = 0.02
@@ -88,8 +87,9 @@ def fit_edge(edge: Edge, evidence: Evidence, storey: Storey) -> None:
     ends, to half a cell."""
     if edge.face is None:
         return
-    for within in (FIT_M, FIT_M):
-        mask = _points_on_edge(edge, edge.face, evidence, within, min(0.1, (edge.span[1] - edge.span[0]) / 4.0))
+    members = evidence.points[edge.face.members, :2]
+    for _ in range(2):
+        mask = edge.face.members[_are_on_edge(edge, members, min(0.1, (edge.span[1] - edge.span[0]) / 4.0))]
         high = mask[evidence.points[mask, 2] - storey.bottom_m > tall_m(storey)]
         mask = high if len(high) >= LEAST_POINTS else mask
         if len(mask) == 0:
@@ -105,12 +105,11 @@ def fit_edge(edge: Edge, evidence: Evidence, storey: Storey) -> None:
         edge.angle_sigma = float(np.hypot(sigma / max(float(t.std()) * 2.0, 0.1), np.radians(0.03)))
 
 
-def _points_on_edge(edge: Edge, face: Face, evidence: Evidence, within_m: float, end_m: float) -> I64:
-    """Return the numbers (n,) of the points of a face that lie on an edge."""
+def _are_on_edge(edge: Edge, points: F64, end_m: float) -> Bool:
+    """Say of points (n, 2) if they lie on an edge, within FIT_M of its line and not within `end_m` of its ends."""
     a, b = edge.span
-    points = evidence.points[face.members, :2]
     t, off = matmul(points, edge.along), matmul(points, edge.normal) - edge.offset_m
-    return np.asarray(face.members[(np.abs(off) < within_m) & (t > a + end_m) & (t < b - end_m)])
+    return np.asarray((np.abs(off) < FIT_M) & (t > a + end_m) & (t < b - end_m))
 
 
 def rotate_edge(edge: Edge, points: F64, information: F64) -> None:

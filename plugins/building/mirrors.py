@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -61,6 +61,14 @@ class UprightReadings:
     eyes: F64
     keys: I64
     voxels: I32
+    computed: dict[tuple[float, float], F64] = field(default_factory=dict)
+
+    def along(self, direction: F64) -> F64:
+        """Return the places (n,) of the readings along a direction (2,) on the plan. Faces have few: those of each are computed once."""
+        key = float(direction[0]), float(direction[1])
+        if key not in self.computed:
+            self.computed[key] = matmul(self.points[:, :2], direction)
+        return self.computed[key]
 
 
 @dataclass(frozen=True)
@@ -144,21 +152,21 @@ def _crossing(readings: UprightReadings, space: FreeSpace, storey: Storey, face:
     One speaks for a mirror if its reflection is read before the face; against it if it is read from behind the face too, or if rays pass where its
     reflection is; neither if both or none is so. A wall square to the face is no evidence unless the face reaches it: it may go on behind."""
     points, normals, eyes, normal = readings.points, readings.normals, readings.eyes, face.normal
-    off = matmul(points[:, :2], normal) - face.offset_m
+    off, along_face = readings.along(normal) - face.offset_m, readings.along(face.along)
     away = matmul(eyes[:, :2], normal) - face.offset_m
     rays = np.nonzero((away > BEFORE_M)[readings.rows] & (off < -BEHIND_M))[0]
     rows = readings.rows[rays]
     share = away[rows] / (away[rows] - off[rays])
-    along = (1.0 - share) * matmul(eyes[:, :2], face.along)[rows] + share * matmul(points[rays, :2], face.along)
+    along = (1.0 - share) * matmul(eyes[:, :2], face.along)[rows] + share * along_face[rays]
     inside = (along > span[0]) & (along < span[1])
     rays, rows, share, along = rays[inside], rows[inside], share[inside], along[inside]
     height = (1.0 - share) * eyes[rows, 2] + share * points[rays, 2]
     column, level = (np.floor(each).astype(int) for each in ((along - face.start_m) / CELL_M, (height - storey.bottom_m) / LEVEL_M))
     read = face.count[np.clip(column, 0, len(face.count) - 1), np.clip(level, 0, LEVELS - 1)] >= LEAST_READINGS
     inside = ~(read & (column >= 0) & (column < len(face.count)))
-    rays, along, height, before = rays[inside], along[inside], height[inside], away[readings.rows] > 0.0
+    rays, along, height, before = rays[inside], along[inside], height[inside], (away > 0.0)[readings.rows]
     facing = matmul(normals[rays, :2], normal)
-    column = np.floor((matmul(points[rays, :2], face.along) - face.start_m) / CELL_M).astype(int)
+    column = np.floor((along_face[rays] - face.start_m) / CELL_M).astype(int)
     reached = sliding_sum(np.pad(face.count.any(axis=1), REACH).astype(np.float64), np.ones(2 * REACH + 1)) > 0.0
     met = reached[np.clip(column + REACH, 0, len(reached) - 1)]
     evidence, judged = np.zeros(len(rays)), np.nonzero((np.abs(facing) > FACING) | met)[0]
@@ -192,11 +200,15 @@ def _voxels(points: F64, normals: F64) -> I64:
 
 def _is_read(points: F64, normals: F64, readings: UprightReadings, chosen: Bool) -> Bool:
     """Say of points (n, 3) with normals (n, 3) if any of the chosen readings (m,) is in their voxel, or in one that shares a side with it."""
-    known = np.bincount(readings.voxels[chosen], minlength=len(readings.keys)) > 0
-    keys, out = _voxels(points, normals), np.zeros(len(points), np.bool_)
+    known, keys = np.zeros(len(readings.keys), np.bool_), _voxels(points, normals)
+    known[readings.voxels[chosen]] = True
+    out, left = np.zeros(len(points), np.bool_), np.arange(len(points))
     for step in NEIGHBOURS:
-        at = np.minimum(np.searchsorted(readings.keys, keys + step), len(known) - 1)
-        out |= (readings.keys[at] == keys + step) & known[at]
+        wanted = keys[left] + step
+        at = np.minimum(np.searchsorted(readings.keys, wanted), len(known) - 1)
+        there = (readings.keys[at] == wanted) & known[at]
+        out[left[there]] = True
+        left = left[~there]
     return out
 
 

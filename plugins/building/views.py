@@ -143,8 +143,9 @@ def _regions(view: KeyframeView) -> tuple[F64, F64, F64, F64, F64]:
     points = camera.back_project(np.stack([c, r], axis=1), depth)
     plane = view.labels[r, c].astype(int) - 1
     normals = view.coefficients[plane, :3]
-    cosine = np.clip(-(points * normals).sum(axis=1) / np.linalg.norm(points, axis=1), 0.1, 1.0)
-    sigma = camera.depth_noise.sigma_m(depth) * np.clip(-(points * normals).sum(axis=1) / depth, 0.05, None)
+    away = -(points * normals).sum(axis=1)
+    cosine = np.clip(away / np.linalg.norm(points, axis=1), 0.1, 1.0)
+    sigma = camera.depth_noise.sigma_m(depth) * np.clip(away / depth, 0.05, None)
     area = (STRIDE * depth) ** 2 / (camera.fx * camera.fy * cosine)
     return points, normals, 1.0 / np.maximum(sigma, 1e-3) ** 2, area, np.asarray(np.bincount(plane, area, len(view.coefficients)), np.float64)
 
