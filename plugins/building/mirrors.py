@@ -8,6 +8,7 @@ import numpy as np
 
 from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import F64, I32, Bool
+from trihedron.plugins.building.edges import FIT_M
 from trihedron.plugins.building.evidence import Evidence
 from trihedron.plugins.building.faces import HIGH_M, LEAST_READINGS, Face, close_gaps, longest_run, runs_of
 from trihedron.plugins.building.free_space import CELL_M, LEVEL_M, FreeSpace
@@ -25,6 +26,7 @@ REACH = 3  # columns, of a face to the wall square to it that it reaches
 BROAD, LEAST_WEIGHT = 3, 4.0  # neighbouring columns of a face that are judged together, the evidence that decides
 MOVED = 1e-4  # of the information of a reading that is put onto a mirror, which does not say where that is
 NARROWEST_M, RIM_M = 0.25, 0.05
+BLOCKED_M = 0.8  # behind a face, for furniture and curtains on the other side of its wall
 ASIDE_M = 0.4  # from the way of the camera to the jamb of what it goes through
 LEAST_FACE_M, WIDEST_M = 0.2, 1.2  # of a face that is read, of a gap in it and of what is beside it
 
@@ -73,9 +75,10 @@ class UprightReadings:
 
 @dataclass(frozen=True)
 class Crossing:
-    """Readings whose rays cross a line on the plan: where along it (n,) and at which heights (n,), and what each counts for a mirror there (n,), less
-    than 0 against it; which (n,) are of surfaces that face the line."""
+    """Numbers (n,) of readings whose rays cross a line on the plan: where along it (n,) and at which heights (n,), and what each counts for a mirror
+    there (n,), less than 0 against it; which (n,) are of surfaces that face the line."""
 
+    readings: I64
     along: F64
     height: F64
     evidence: F64
@@ -130,27 +133,52 @@ def _mirrors_on(face: Face, framed: Bool, crossing: Crossing, storey: Storey, ey
 
 
 def reflection_evidence(
-    face: Face, span: tuple[float, float], heights: tuple[float, float], readings: UprightReadings, space: FreeSpace, storey: Storey
+    face: Face, span: tuple[float, float], heights: tuple[float, float], depth_m: float, readings: UprightReadings, space: FreeSpace, storey: Storey
 ) -> float:
-    """Return what the readings through a part of a face count for a mirror there, less than 0 against it; nobody walks through a mirror."""
+    """Return what the readings through a part of a face of a wall that is `depth_m` thick count for a mirror there, less than 0 against it. Nobody
+    walks through a mirror, and through an opening no rays pass what stands behind it."""
     if _is_walked_through(face, span, readings.eyes):
         return -float("inf")
     crossing = _crossing(readings, space, storey, face, span)
     within = (crossing.height > heights[0]) & (crossing.height < heights[1])
-    return float(_together(*(each[within].sum() for each in crossing.parts)))
+    blocked, rows = _are_blocked(crossing, readings, face, depth_m)[within], readings.rows[crossing.readings[within]]
+    if 2 * blocked.sum() > len(blocked):
+        return _by_view(blocked.astype(np.float64), rows)
+    return float(_together(*(_by_view(each[within], rows) for each in crossing.parts)))
 
 
-def _together(facing: F64, aside: F64) -> F64:
+def _by_view(evidence: F64, rows: I32) -> float:
+    """Add the evidence (n,) of views (n,), none of which decides alone: the readings of one err together."""
+    return float(np.clip(np.bincount(rows, evidence), -LEAST_WEIGHT / 2.0, LEAST_WEIGHT / 2.0).sum())
+
+
+def _are_blocked(crossing: Crossing, readings: UprightReadings, face: Face, depth_m: float) -> Bool:
+    """Say of rays (n,) that cross a face of a wall if, within BLOCKED_M behind it and well before they end, they pass what stands behind the wall: it
+    is read from there and faces away from it."""
+    ends, away = readings.points[crossing.readings], readings.along(face.normal) - face.offset_m
+    behind = (matmul(readings.eyes[:, :2], face.normal) < face.offset_m)[readings.rows] & (away < -depth_m - FIT_M)
+    starts = np.column_stack([crossing.along[:, None] * face.along + face.offset_m * face.normal, crossing.height])
+    length = np.linalg.norm(ends - starts, axis=1)
+    normals = np.broadcast_to([*-face.normal, 0.0], ends.shape)
+    out = np.zeros(len(ends), np.bool_)
+    for step in np.arange(SAME_M, BLOCKED_M, SAME_M).tolist():
+        places = starts + (ends - starts) * (step / length)[:, None]
+        out |= (step < length - 2.0 * SAME_M) & _is_read(places, normals, readings, behind)
+    return out
+
+
+def _together(facing: F64 | float, aside: F64 | float) -> F64:
     """Add the evidence of surfaces that face a line and of walls square to it. These err together, reading by reading: all of them decide once, and
     not against a single reading of what faces the line."""
-    return facing + np.clip(aside, -LEAST_WEIGHT, LEAST_WEIGHT)
+    return np.asarray(facing + np.clip(aside, -LEAST_WEIGHT, LEAST_WEIGHT), np.float64)
 
 
 def _crossing(readings: UprightReadings, space: FreeSpace, storey: Storey, face: Face, span: tuple[float, float]) -> Crossing:
     """Compare the readings through a stretch of the line of a face, where that is not read itself, with what is known before it and behind it.
 
     One speaks for a mirror if its reflection is read before the face; against it if it is read from behind the face too, or if rays pass where its
-    reflection is; neither if both or none is so. A wall square to the face is no evidence unless the face reaches it: it may go on behind."""
+    reflection is, above and below; neither if both or none is so, or if what is read there faces the other way: rays pass on both sides of a thin
+    thing. A wall square to the face is no evidence unless the face reaches it: it may go on behind."""
     points, normals, eyes, normal = readings.points, readings.normals, readings.eyes, face.normal
     off, along_face = readings.along(normal) - face.offset_m, readings.along(face.along)
     away = matmul(eyes[:, :2], normal) - face.offset_m
@@ -177,11 +205,13 @@ def _crossing(readings: UprightReadings, space: FreeSpace, storey: Storey, face:
     turned[:, :2] -= 2.0 * facing[judged, None] * normal
     repeats = _is_read(reflected, turned, readings, before & (off > 0.0))
     left = np.nonzero(~repeats & ~real)[0]
-    free = np.all([space.passed(reflected[left] + step * SAME_M * turned[left], storey.bottom_m) for step in range(-2, 3)], axis=0)
+    left = left[~_is_read(reflected[left], -turned[left], readings, before & (off > 0.0))]
+    around = [*(step * turned[left] for step in range(-2, 3)), np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, -1.0])]
+    free = np.all([space.passed(reflected[left] + SAME_M * step, storey.bottom_m) for step in around], axis=0)
     against = real & ~repeats
     against[left[free]] = True
     evidence[judged] = np.where(against, -1.0, np.where(repeats & ~real, 1.0, 0.0))
-    return Crossing(along, height, evidence, np.abs(facing) > FACING)
+    return Crossing(rays, along, height, evidence, np.abs(facing) > FACING)
 
 
 def _is_walked_through(face: Face, span: tuple[float, float], eyes: F64) -> bool:

@@ -73,9 +73,10 @@ def is_niche(opening: OpeningPlan, wall: WallPlan, space: FreeSpace) -> bool:
 def _is_mirror(opening: OpeningPlan, wall: WallPlan, storey: Storey, space: FreeSpace, readings: UprightReadings) -> bool:
     """Say if an opening is a mirror on either side of its wall, as it is taken for where nothing decides and there is a room on one side only."""
     (a, b), (low, high), evidence = opening.span, opening.heights, 0.0
+    depth = wall.thickness_m if np.isfinite(wall.thickness_m) else 0.0
     for face in {id(edge.face): edge.face for _, edge in wall.edges if edge.face is not None}.values():
         span = (a, b) if matmul(face.normal, wall.edge.normal) > 0.0 else (-b, -a)
-        evidence += reflection_evidence(face, span, (storey.bottom_m + low, storey.bottom_m + high), readings, space, storey)
+        evidence += reflection_evidence(face, span, (storey.bottom_m + low, storey.bottom_m + high), depth, readings, space, storey)
     return evidence >= LEAST_WEIGHT or (evidence > -LEAST_WEIGHT and min(opening.rooms) < 0)
 
 

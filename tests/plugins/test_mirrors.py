@@ -102,46 +102,67 @@ def test_the_mirrored_door_of_a_wardrobe_is_a_mirror(walk, monkeypatch: pytest.M
     plan, found = found_mirrors(inputs, monkeypatch)
     doors = [pane for pane in glazed_flat(FLAT).room.panes if pane.kind is Glass.mirror and pane.size_m == pytest.approx((0.7, 1.85))]
     to_building = np.linalg.inv(plan.T_world_building)
-    told = 0
+    found_doors = 0
     for door in doors:
         middle = door.origin + 0.5 * (door.size_m[0] * door.u + door.size_m[1] * door.v)
         x, y = (to_building[:3, :3] @ middle + to_building[:3, 3])[:2]
-        told += any(
+        found_doors += any(
             abs(np.dot(mirror.normal, [x, y]) - mirror.offset_m) < 0.1
             and mirror.span[0] < x * mirror.normal[1] - y * mirror.normal[0] < mirror.span[1]
             for mirror in found
         )
-    assert told >= 1
+    assert found_doors >= 1
 
 
-def told(*surfaces: tuple[int, tuple[float, float], float], free: bool = False) -> float:
-    """Return the evidence for a mirror on the line y = 0 that the first surface is read through, by view 0; surfaces have a view, where on the plan
-    they are, and where they look to in degrees, and are read 20 times."""
-    eyes = np.array([[0.0, 2.5, 1.2], [5.0, 2.5, 1.2], [5.0, -0.5, 1.2]])  # the last two walk round the end of the line
-    points = np.array([(x, y, 1.2) for _, (x, y), _ in surfaces for _ in range(80)])
+def counted(*surfaces: tuple[int, tuple[float, float], float], free: int = 0) -> float:
+    """Return the evidence for a mirror on the line y = 0; surfaces have a view, where on the plan they are, and where they look to in degrees, and
+    are read 20 times at a height of 1.25 m. `free` are the levels that rays pass everywhere, as bits."""
+    eyes = np.array([[0.0, 2.5, 1.25], [0.1, 2.5, 1.25], [5.0, 2.5, 1.25], [5.0, -0.5, 1.25]])  # two look at it, two walk round its end
+    points = np.array([(x, y, 1.25) for _, (x, y), _ in surfaces for _ in range(80)])
     normals = np.array([(np.cos(np.radians(angle)), np.sin(np.radians(angle)), 0.0) for *_, angle in surfaces for _ in range(80)])
     poses = [np.eye(4) for _ in eyes]
     for T, eye in zip(poses, eyes):
         T[:3, 3] = eye
     rows = np.repeat(np.array([view for view, *_ in surfaces], np.int32), 80)
-    evidence = Evidence(np.eye(4), [], poses, np.zeros((3, 3, 3)), points, normals, np.ones(len(points)), np.ones(len(points)), rows)
+    evidence = Evidence(np.eye(4), [], poses, np.zeros((4, 3, 3)), points, normals, np.ones(len(points)), np.ones(len(points)), rows)
     count = np.zeros((40, LEVELS), np.int32)
     count[[0, 1, 38, 39], :25] = 5  # read at both ends
     face = Face(np.array([0.0, 1.0]), 0.0, -1.0, count, np.zeros(40, np.bool_), np.zeros(0, np.int64))
-    levels = np.full((200, 200), 0xFFFFFFFF if free else 0, np.uint32)
-    space = FreeSpace(np.array([-5.0, -5.0]), levels, np.zeros((200, 200), np.bool_), np.zeros((200, 200), np.bool_))
+    space = FreeSpace(np.array([-5.0, -5.0]), np.full((200, 200), free, np.uint32), np.zeros((200, 200), np.bool_), np.zeros((200, 200), np.bool_))
     storey = Storey(0.0, 2.6, 2.6)
-    return reflection_evidence(face, (-0.9, 0.9), (0.0, 2.0), upright_readings(evidence, storey), space, storey)
+    return reflection_evidence(face, (-0.9, 0.9), (0.0, 2.0), 0.1, upright_readings(evidence, storey), space, storey)
+
+
+EVERYWHERE = 0xFFFFFFFF
+BEHIND = (0, (0.0, -2.0), 90.0), (1, (0.0, -2.0), 90.0)  # what two views read through the line
+REFLECTION, REAL = (2, (0.0, 2.0), -90.0), (3, (0.0, -2.0), 90.0)
 
 
 def test_a_reading_is_evidence_for_a_mirror_against_one_or_neither() -> None:
-    behind, reflection, real = (0, (0.0, -2.0), 90.0), (1, (0.0, 2.0), -90.0), (2, (0.0, -2.0), 90.0)
-    assert told(behind, reflection) == 20.0
-    assert told(behind, real) == told(behind, free=True) == -20.0
-    assert told(behind) == told(behind, reflection, real) == 0.0
+    assert counted(*BEHIND, REFLECTION) == LEAST_WEIGHT
+    assert counted(*BEHIND, REAL) == counted(*BEHIND, free=EVERYWHERE) == -LEAST_WEIGHT
+    assert counted(*BEHIND) == counted(*BEHIND, REFLECTION, REAL) == 0.0
+
+
+def test_one_view_does_not_decide_alone() -> None:
+    assert counted(BEHIND[0], REFLECTION) == LEAST_WEIGHT / 2.0
+    assert counted(BEHIND[0], REAL) == -LEAST_WEIGHT / 2.0
+
+
+def test_rays_past_a_thin_thing_or_over_its_top_do_not_contradict_its_reflection() -> None:
+    leaf = (2, (0.0, 2.0), 90.0)  # read from its other side
+    assert counted(*BEHIND, leaf, free=EVERYWHERE) == 0.0
+    over = EVERYWHERE ^ ((1 << 12) - 1)  # at 1.2 m and above
+    assert counted(*BEHIND, free=over) == 0.0 and counted(*BEHIND, free=over | 1 << 11) == -LEAST_WEIGHT
+
+
+def test_rays_through_what_stands_behind_the_wall_show_a_mirror() -> None:
+    curtain, own_face = (3, (0.0, -0.35), -90.0), (3, (0.0, -0.1), -90.0)
+    assert counted(*BEHIND, REAL, curtain) == LEAST_WEIGHT
+    assert counted(*BEHIND, REAL, own_face) == -LEAST_WEIGHT  # beside the opening
 
 
 def test_walls_square_to_a_mirror_decide_only_where_nothing_that_faces_it_speaks_against() -> None:
-    square, repeated = (0, (-0.95, -0.5), 0.0), (1, (-0.95, 0.5), 0.0)
-    assert told(square, repeated) == LEAST_WEIGHT
-    assert told(square, repeated, (0, (0.0, -2.0), 90.0), (2, (0.0, -2.0), 90.0)) < 0.0
+    square = (0, (-0.95, -0.5), 0.0), (1, (-0.95, -0.5), 0.0)
+    assert counted(*square, (2, (-0.95, 0.5), 0.0)) == LEAST_WEIGHT
+    assert counted(*square, (2, (-0.95, 0.5), 0.0), *BEHIND, REAL) == 0.0
