@@ -96,12 +96,13 @@ def _compile(what: str, progress: Progress, **variables: str) -> float:
 def compile_once(stages: Sequence[str], frames: int | None) -> None:
     """Fill the cache before a run of these stages, unless that was done for these versions and this processor, or a wheel brought the machine code.
     For a run of more than SHORT `frames`, or a live one (None), with all that it may come to need: no frame waits for the compiler when a loop is
-    closed. A graph of other stages compiles what it calls as it runs, and so does any run where the variable TRIHEDRON_COMPILE is 0."""
-    what = "all" if frames is None or frames > SHORT else "tracking"
+    closed. A graph that lacks some of STAGES compiles what it calls as it runs, unless it is live: a camera does not wait. So does any run where the
+    variable TRIHEDRON_COMPILE is 0."""
+    what, has = ("all" if frames is None or frames > SHORT else "tracking"), STAGES & set(stages)
     if archive() is not None:
         return
     with _ONCE:
-        if os.environ.get(SWITCH) != "0" and set(stages) >= STAGES and not (marker(what).exists() or marker("all").exists()):
+        if os.environ.get(SWITCH) != "0" and (has == STAGES or (has and frames is None)) and not (marker(what).exists() or marker("all").exists()):
             with suppress(TrihedronError, OSError):  # the run compiles by itself
                 compile_kernels(what)
 

@@ -144,7 +144,8 @@ def test_a_run_compiles_beforehand_what_its_kind_needs(compiled):
     compilation.compile_once(["dataset", *compilation.STAGES], frames=60)
     compilation.compile_once(["dataset", *compilation.STAGES], frames=500)
     compilation.compile_once(["dataset", *compilation.STAGES], frames=None)
-    assert compiled == ["tracking", "all", "all"]
+    compilation.compile_once(["dataset", "keypoints"], frames=None)
+    assert compiled == ["tracking", "all", "all", "all"]
 
 
 def test_nothing_is_compiled_beforehand_twice_for_other_graphs_or_where_it_is_switched_off(compiled, monkeypatch):
