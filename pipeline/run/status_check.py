@@ -3,7 +3,8 @@
 Poses count as they were estimated at the time. Each sub-map has a world of its own and is aligned with the truth by itself, robustly, over its `ok`
 frames, since the others claim nothing, or over all posed ones where it has fewer than LEAST_OK of these; smaller sub-maps are left out. An `ok`
 frame is wrong where it is off by more than WRONG_M and SIGMAS standard deviations, or by more than WRONG_DEG and SIGMAS; the first pose, which
-defines the world, is never. Positions are in the camera frame.
+defines the world, is never. It must be so after the alignment that the covariances make most likely, too: σ is that of a pose in the world of the
+first camera, and an alignment over all poses puts half of a drift to where it began. Positions are in the camera frame.
 
 Sharpness is compared with the error by the spread–skill ratio (Fortin et al., Journal of Hydrometeorology 2014): the root of the mean stated variance
 of the position over the root mean square of its error, after the alignment that the covariances make most likely, as NEES. 1 is honest, more is too
@@ -43,8 +44,9 @@ EXACT = 1e-10  # total variance below which a pose is exact by definition, as th
 class FrameErrors:
     """Errors (n,) of the posed frames with truth: metres, degrees, the largest stated standard deviations, NEES (6 degrees of freedom), and the
     logarithm of the likelihood of the error (nats). `likely_m` is the error of the position after the alignment that the covariances make most
-    likely, `spread_m` the root of its stated variance, along all axes. The latter four are NaN of a pose that is exact by definition. `ok` is the
-    status; `judged` is False in sub-maps that are too small, whose errors are NaN; `exact` is True of poses that are exact by definition."""
+    likely, `likely_deg` that of the rotation, `spread_m` the root of the position's stated variance, along all axes. The latter five are NaN of a
+    pose that is exact by definition. `ok` is the status; `judged` is False in sub-maps that are too small, whose errors are NaN; `exact` is True of
+    poses that are exact by definition."""
 
     indices: F64
     judged: Bool
@@ -57,13 +59,14 @@ class FrameErrors:
     nees: F64
     log_likelihood: F64
     likely_m: F64
+    likely_deg: F64
     spread_m: F64
 
     @property
     def wrong_ok(self) -> Bool:
-        """Return (n,) whether an `ok` frame is off by more than it states."""
-        far = (self.error_m > WRONG_M) & (self.error_m > SIGMAS * self.sigma_m)
-        turned = (self.error_deg > WRONG_DEG) & (self.error_deg > SIGMAS * self.sigma_deg)
+        """Return (n,) whether an `ok` frame is off by more than it states, after either alignment."""
+        far = np.minimum(self.error_m, self.likely_m) > np.maximum(WRONG_M, SIGMAS * self.sigma_m)
+        turned = np.minimum(self.error_deg, self.likely_deg) > np.maximum(WRONG_DEG, SIGMAS * self.sigma_deg)
         return np.asarray(self.ok & self.judged & ~self.exact & (far | turned))
 
 
@@ -157,7 +160,7 @@ def _frame_errors(poses: Sequence[Pose], truth: Trajectory) -> tuple[FrameErrors
     pairs = associate(np.array([pose.stamp_ns for pose in posed], np.int64), truth.stamps_ns)
     known, true = [posed[row] for row, _ in pairs], truth.poses[pairs[:, 1]].reshape(-1, 4, 4)
     n = len(known)
-    error_m, error_deg, nees, likelihood, likely, spread = (np.full(n, np.nan) for _ in range(6))
+    error_m, error_deg, nees, likelihood, likely_m, likely_deg, spread = (np.full(n, np.nan) for _ in range(7))
     judged = np.zeros(n, bool)
     T = np.array([pose.T_world_camera for pose in known]).reshape(-1, 4, 4)
     S = np.array([pose.covariance for pose in known]).reshape(-1, 6, 6) + TINY * np.eye(6)
@@ -174,12 +177,12 @@ def _frame_errors(poses: Sequence[Pose], truth: Trajectory) -> tuple[FrameErrors
         if len(rows) < 2:
             continue
         covariances = S[rows] + _noise_of_truth([known[row] for row in rows], true[rows]).covariance
-        nees[rows], likelihood[rows], likely[rows] = _normalised_errors(T[rows], covariances, true[rows])
+        nees[rows], likelihood[rows], likely_m[rows], likely_deg[rows] = _normalised_errors(T[rows], covariances, true[rows])
         spread[rows] = np.sqrt(np.trace(covariances[:, :3, :3], axis1=1, axis2=2))
     sigma = np.sqrt(np.diagonal(S, axis1=1, axis2=2))
     indices = np.array([pose.index for pose in known], float)
     sigma_m, sigma_deg = sigma[:, :3].max(axis=1, initial=0.0), np.degrees(sigma[:, 3:].max(axis=1, initial=0.0))
-    errors = FrameErrors(indices, judged, ok, exact, error_m, error_deg, sigma_m, sigma_deg, nees, likelihood, likely, spread)
+    errors = FrameErrors(indices, judged, ok, exact, error_m, error_deg, sigma_m, sigma_deg, nees, likelihood, likely_m, likely_deg, spread)
     return errors, known, true
 
 
@@ -202,12 +205,13 @@ def _noise_of_truth(poses: Sequence[Pose], true: F64) -> TruthNoise:
     return truth_noise(T, local, true, indices)
 
 
-def _normalised_errors(T: F64, covariances: F64, true: F64) -> tuple[F64, F64, F64]:
-    """Return (n,) NEES, log-likelihood in nats and metres of the errors of poses."""
+def _normalised_errors(T: F64, covariances: F64, true: F64) -> tuple[F64, F64, F64, F64]:
+    """Return (n,) NEES, log-likelihood in nats, metres and degrees of the errors of poses."""
     errors = gauge_free_errors(T, covariances, true)
     nees = normalised_squares(errors, covariances)
     log_determinants = 2.0 * np.log(np.diagonal(cholesky(2.0 * np.pi * covariances), axis1=1, axis2=2)).sum(axis=1)
-    return nees, -0.5 * (nees + log_determinants), np.linalg.norm(errors[:, :3], axis=1)
+    metres, degrees = np.linalg.norm(errors[:, :3], axis=1), np.degrees(np.linalg.norm(errors[:, 3:], axis=1))
+    return nees, -0.5 * (nees + log_determinants), metres, degrees
 
 
 def _steps(known: Sequence[Pose], true: F64) -> tuple[int, int]:

@@ -58,6 +58,19 @@ def test_ok_frames_that_are_off_by_more_than_they_state_are_wrong(moved: np.ndar
     assert check_status(poses, truth)[0].wrong_ok == 0
 
 
+@pytest.mark.parametrize("stated, wrong", [(True, False), (False, True)])
+def test_a_drift_that_is_stated_is_not_wrong_where_it_began(stated: bool, wrong: bool) -> None:
+    poses, truth = run_of()
+    for i, pose in enumerate(poses):
+        drift = 0.001 * i  # 40 cm at the end, of which an alignment over all puts 20 cm to the start
+        sigma = max(drift, 0.004) if stated else 0.004
+        T = exp_se3(np.array([drift, 0, 0, 0, 0, 0])) @ pose.T_world_camera
+        poses[i] = replace(pose, T_world_camera=T, covariance=sigma**2 * np.eye(6))
+    check, errors = check_status(poses, truth)
+    assert errors.error_m[:40].min() > 0.05 and errors.sigma_m[:40].max() < 0.04
+    assert (check.wrong_ok > 0) == wrong
+
+
 def test_each_sub_map_is_aligned_by_itself_and_lost_frames_do_not_count() -> None:
     poses, truth = run_of(submap_from=200)
     poses[300] = replace(poses[300], status=LOST, reason="covered", T_world_camera=np.eye(4))

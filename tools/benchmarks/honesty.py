@@ -3,7 +3,7 @@
 Rows: each sensor (over rooms and seeds), each room (over sensors and seeds), each recorded sequence given (whole), each case of degenerate input, and
 all clean runs, which are those without a fault. Columns:
   ok %, lost %  share of the frames; of clean runs, what is not ok is a false alarm, and a second table counts these by the test that failed
-  wrong ok      ok frames that are off by more than 5 cm and 4 σ, or by more than 2° and 4 σ
+  wrong ok      ok frames that are off by more than 5 cm and 4 σ, or by more than 2° and 4 σ, after the alignment of ATE and after that of NEES
   ATE mm        of the posed frames as estimated at the time, each sub-map aligned by itself
   NEES          median over the frames, 6 degrees of freedom; honest: 5.35
   in 95 %       frames below the 95 % limit of NEES; honest: 95
