@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 from importlib import metadata
 
 import cv2
@@ -14,6 +15,7 @@ from trihedron.datasets.simulation.synthetic import Synthetic
 from trihedron.pipeline.core import types
 from trihedron.pipeline.record import reader
 from trihedron.plugins.keypoints.onnx import KeypointNetwork
+from trihedron.plugins.shared.calibration_error import calibration_covariance
 from trihedron.stages import IMAGES
 
 LENGTH = 24
@@ -53,6 +55,19 @@ def camera(folder):
 def slam(camera):
     with th.Slam(camera, "planes=connected_components", "record.frames=true", manhattan="mean_shift", outputs=["trajectory"]) as made:
         yield made
+
+
+def test_the_covariance_of_a_camera_that_is_known_exactly_has_no_share_of_its_calibration(folder, camera):
+    exact = th.CalibrationSigmas(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    poses = []
+    for one in (camera, replace(camera, sigmas=exact)):
+        with th.Slam(one) as made:
+            poses.append([made.track(*image) for image in images(folder)][-1])
+    shares = [np.trace(calibration_covariance(pose)) for pose in poses]
+    assert shares[0] > 0.0 == shares[1]
+    assert np.trace(poses[0].covariance) - np.trace(poses[1].covariance) == pytest.approx(shares[0], rel=0.01)
+    with pytest.raises(th.TrihedronError, match="camera: sigmas is float, not CalibrationSigmas; give the numbers of a calibration, in pixels"):
+        replace(camera, sigmas=0.01)
 
 
 @pytest.mark.parametrize("quiet", [False, True])

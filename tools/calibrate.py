@@ -12,7 +12,7 @@ Example: trihedron calibrate runs/a/run.mcap --out camera.yaml
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,7 @@ from trihedron.datasets.readers.registration import DepthCamera
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.files import write_file
 from trihedron.pipeline.core.text_table import table
-from trihedron.pipeline.core.types import F64, Camera
+from trihedron.pipeline.core.types import F64, CalibrationSigmas, Camera
 from trihedron.pipeline.record.reader import Recording
 from trihedron.tools import calibration_edges, calibration_pairs
 from trihedron.tools.arguments import Parser
@@ -247,6 +247,9 @@ def keys_of(calibration: Calibration) -> dict[str, Any]:
     keys |= {"depth_scale": calibration.depth_scale, "fps": camera.fps}
     keys |= {"distortion": list(calibration.distortion)} if calibration.distortion else {}
     keys |= {name: round(value, 6) for name in ("depth_offset", "depth_radial") if (value := getattr(calibration, name))}
+    usual = asdict(CalibrationSigmas())
+    if sigmas := {name: value for name, value in asdict(camera.sigmas).items() if value != usual[name]}:
+        keys["sigmas"] = sigmas
     if given is not None:
         own: dict[str, Any] = {name: round(float(getattr(given, name)), 3) for name in ("fx", "fy", "cx", "cy")}
         keys["depth_camera"] = own | {

@@ -56,7 +56,7 @@ def resize_frame(color: U8, depth_m: F32, camera: Camera, times: float) -> tuple
     width, height = round(camera.width * times), round(camera.height * times)
     sx, sy = width / camera.width, height / camera.height
     centre = (camera.cx + 0.5) * sx - 0.5, (camera.cy + 0.5) * sy - 0.5
-    stated = Camera(width, height, camera.fx * sx, camera.fy * sy, *centre, camera.fps, camera.depth_noise)
+    stated = Camera(width, height, camera.fx * sx, camera.fy * sy, *centre, camera.fps, camera.depth_noise, camera.sigmas)
     small = cv2.resize(color, (width, height), interpolation=cv2.INTER_AREA if times < 1.0 else cv2.INTER_LINEAR)
     return np.asarray(small, np.uint8), np.asarray(cv2.resize(depth_m, (width, height), interpolation=cv2.INTER_NEAREST), np.float32), stated
 

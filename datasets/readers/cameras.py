@@ -13,12 +13,12 @@ from trihedron.datasets.readers.images import MAX_PIXELS
 from trihedron.datasets.readers.registration import DepthCamera, Rectification
 from trihedron.pipeline.core.errors import DataError, did_you_mean, printable
 from trihedron.pipeline.core.files import MAX_YAML_BYTES, SHOWN, YamlError, parse_yaml, read_text
-from trihedron.pipeline.core.types import EXACT_DEPTH, Camera, DepthNoise
+from trihedron.pipeline.core.types import EXACT_DEPTH, CalibrationSigmas, Camera, DepthNoise
 from trihedron.pipeline.core.value_checks import camera_fault
 
 CAMERA_FILE = "camera.yaml"
 REQUIRED = ("width", "height", "fx", "fy", "cx", "cy", "depth_scale")
-OPTIONAL = ("distortion", "fps", "depth_noise", "depth_offset", "depth_radial", "depth_camera")
+OPTIONAL = ("distortion", "fps", "depth_noise", "depth_offset", "depth_radial", "depth_camera", "sigmas")
 SMALLEST_SCALE, LARGEST_SCALE = 1e-6, 1e9  # outside, single precision overflows
 LARGEST_COEFFICIENT = 100.0  # of a distortion; those of lenses are below 10
 LARGEST_RADIAL = 0.5
@@ -88,7 +88,7 @@ def choose_calibration(folder: Path, choice: str, default: str = "") -> Calibrat
 
 def read_camera_file(path: Path) -> Calibration:
     """Read a camera.yaml: `width height fx fy cx cy depth_scale [distortion k1 k2 p1 p2 k3] [fps]
-    [depth_noise kinect|exact] [depth_offset] [depth_radial] [depth_camera fx fy cx cy [translation_m] [rotation_deg]]`.
+    [depth_noise kinect|exact] [depth_offset] [depth_radial] [depth_camera fx fy cx cy [translation_m] [rotation_deg]] [sigmas]`.
 
     Raises DataError naming file and key."""
     try:
@@ -125,7 +125,8 @@ def _calibration(path: Path, content: dict[str, Any]) -> Calibration:
     if not isinstance(noise, str) or noise not in NOISES:
         raise DataError(str(path), f"depth_noise is '{_printable_value(noise)}'", did_you_mean(_printable_value(noise), NOISES))
     fx, fy, cx, cy = (values[key] for key in ("fx", "fy", "cx", "cy"))
-    camera = Camera(int(values["width"]), int(values["height"]), fx, fy, cx, cy, values.get("fps", Camera.fps), NOISES[noise])
+    sigmas = _sigmas(path, content.get("sigmas"))
+    camera = Camera(int(values["width"]), int(values["height"]), fx, fy, cx, cy, values.get("fps", Camera.fps), NOISES[noise], sigmas)
     offset, radial = values.get("depth_offset", 0.0), values.get("depth_radial", 0.0)
     if abs(radial) > LARGEST_RADIAL:
         raise DataError(
@@ -149,6 +150,19 @@ def calibration_fault(found: Calibration) -> str:
     if (depth := found.depth_camera) is not None:
         fault = camera_fault(replace(found.camera, fx=depth.fx, fy=depth.fy, cx=depth.cx, cy=depth.cy))
     return f"depth_camera.{fault}" if fault else ""
+
+
+def _sigmas(path: Path, given: Any) -> CalibrationSigmas:
+    """Read a mapping of some of the fields of `CalibrationSigmas`; the others are those of a camera of a kind."""
+    if given is None:
+        return CalibrationSigmas()
+    known = tuple(field.name for field in fields(CalibrationSigmas))
+    if not isinstance(given, dict):
+        raise DataError(str(path), "sigmas holds no keys", f"give it some of {' '.join(known)}")
+    unknown = next((key for key in given if key not in known), None)
+    if unknown is not None:
+        raise DataError(str(path), f"unknown key 'sigmas.{_printable_value(unknown)}'", did_you_mean(_printable_value(unknown), known))
+    return CalibrationSigmas(**{key: _number(path, f"sigmas.{key}", value) for key, value in given.items()})
 
 
 def _depth_camera(path: Path, given: Any) -> DepthCamera | None:

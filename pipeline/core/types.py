@@ -415,6 +415,22 @@ EXACT_DEPTH = DepthNoise(a_m=0.0, b=0.0, c_per_m=0.0, floor_m=0.001)
 
 
 @dataclass(frozen=True)
+class CalibrationSigmas:
+    """Standard deviations with which a camera's calibration is known; by default those of a camera of a kind, within half a percent of the focal
+    lengths, a few pixels of registration, a percent of a depth. 0 of what is exact."""
+
+    focal: Annotated[float, Within(0.0, 1.0)] = 0.003  # of fx and of fy, relative
+    centre: Annotated[float, Within(0.0, 1.0)] = 0.0019  # of cx and of cy, of the image's width
+    depth_focal: Annotated[float, Within(0.0, 1.0)] = 0.003  # of the focal length of depth, relative to that of colour
+    registration: Annotated[float, Within(0.0, 1.0)] = 0.0022  # of depth to colour along x and along y, of the image's width
+    inverse_depth: Annotated[float, Within(0.0, 1.0)] = 0.002  # 1/m, the same at each distance
+    depth_radial: Annotated[float, Within(0.0, 1.0)] = 0.007  # of depth in the corners of the image, relative
+    readout_s: Annotated[float, Within(0.0, 1.0)] = 0.02  # of colour, first row to last
+    delay_s: Annotated[float, Within(0.0, 1.0)] = 0.012  # of depth relative to colour
+    depth_readout_s: Annotated[float, Within(0.0, 1.0)] = 0.015
+
+
+@dataclass(frozen=True)
 class Camera:
     """An undistorted pinhole camera; readers undistort frames. `fps` is nominal."""
 
@@ -426,6 +442,7 @@ class Camera:
     cy: Annotated[float, Within(-1e6, 1e6)]
     fps: Annotated[float, Within(1e-6, 1e6)] = 30.0
     depth_noise: DepthNoise = field(default_factory=DepthNoise)
+    sigmas: CalibrationSigmas = field(default_factory=CalibrationSigmas)
 
     @property
     def K(self) -> F64:

@@ -7,7 +7,9 @@ would reach compiled kernels, which check nothing. What a plugin of this run com
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
+from dataclasses import fields
 from numbers import Integral, Real
+from operator import attrgetter
 from typing import Annotated, Any, NamedTuple, get_args, get_origin, get_type_hints
 
 import numpy as np
@@ -16,12 +18,12 @@ from trihedron.pipeline.core.constraints import Columns, CoversImage, Finite, In
 from trihedron.pipeline.core.errors import RecordingError
 from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.slots import SLOTS, output_of
-from trihedron.pipeline.core.types import Camera, Frame, Value
+from trihedron.pipeline.core.types import CalibrationSigmas, Camera, Frame, Value
 
 ORTHONORMAL = 1e-6  # of RᵀR - I, its largest element
 CAMERA_NUMBERS = (
     *((name, Integral, "a whole number") for name in ("width", "height")),
-    *((name, Real, "a number") for name in ("fx", "fy", "cx", "cy", "fps")),
+    *((name, Real, "a number") for name in ("fx", "fy", "cx", "cy", "fps", *(f"sigmas.{one.name}" for one in fields(CalibrationSigmas)))),
 )
 PREVIOUS = "previous"  # parameters that take an earlier value begin with it
 LARGEST = 1e100  # of a number; the square of one has to be finite
@@ -30,12 +32,12 @@ CURE = "the file is damaged; record it again"
 
 
 class _Declared(NamedTuple):
-    """Declarations of a value type: (field, constraint) in order, those of them that name other inputs, and the fields that hold a camera, whose own
-    fields are checked too."""
+    """Declarations of a value type: (field, constraint) in order, those of them that name other inputs, and the fields that hold a camera or what
+    belongs to one, whose own fields are checked too."""
 
     constraints: tuple[tuple[str, Any], ...]
     together: tuple[tuple[str, Any], ...]
-    cameras: tuple[str, ...]
+    nested: tuple[str, ...]
 
 
 _KNOWN: dict[type, _Declared] = {}
@@ -51,7 +53,7 @@ def _declared(kind: type) -> _Declared:
         hints = get_type_hints(kind, include_extras=True).items()
         found = [(name, item) for name, hint in hints if get_origin(hint) is Annotated for item in get_args(hint)[1:] if type(item) in _CHECKS]
         together = [(name, item) for name, item in found if isinstance(item, IndexInto | SameWidth | CoversImage)]
-        _KNOWN[kind] = _Declared(tuple(found), tuple(together), tuple(name for name, hint in hints if hint is Camera))
+        _KNOWN[kind] = _Declared(tuple(found), tuple(together), tuple(name for name, hint in hints if hint in (Camera, CalibrationSigmas)))
     return _KNOWN[kind]
 
 
@@ -68,8 +70,10 @@ def validate_value(topic: str, value: Value, place: str, expected: type[Value] =
 
 def camera_fault(camera: Camera) -> str:
     """Return the first number of a camera that is not what `Camera` declares, with the cause, as 'fx is not within 0.001 … 1e+06'; empty for none."""
+    if not isinstance(camera.sigmas, CalibrationSigmas):
+        return f"sigmas is {type(camera.sigmas).__name__}, not CalibrationSigmas"
     for name, kind, described in CAMERA_NUMBERS:
-        value = getattr(camera, name)
+        value = attrgetter(name)(camera)
         if isinstance(value, bool) or not isinstance(value, kind):
             return f"{name} is {type(value).__name__}, not {described}"
     return next((f"{name} {cause}" for name, cause in _faults(camera, "")), "")
@@ -105,7 +109,7 @@ def _faults(value: Any, prefix: str) -> Any:
             yield prefix + name, cause
     if isinstance(value, Frame) and value.color.shape[:2] != (value.camera.height, value.camera.width):
         yield f"{prefix}color", "has not the camera's size"
-    for name in _declared(type(value)).cameras:
+    for name in _declared(type(value)).nested:
         yield from _faults(getattr(value, name), f"{prefix}{name}.")
 
 

@@ -191,7 +191,8 @@ class Decoder:
         for name in own_fields(kind):
             hint, found = hints_of(kind)[name], getattr(message, name)
             if is_nested(hint):
-                self._read(found, hint, f"{prefix}{name}.", fields, tables)
+                if message.HasField(name):
+                    self._read(found, hint, f"{prefix}{name}.", fields, tables)
             elif hint is Table:
                 tables[f"{name}#"] = found.layout
                 tables |= {f"{name}#{array.name}": get_array(array, self.place) for array in found.arrays}

@@ -1,8 +1,7 @@
 """Parameters of a camera's calibration that are not known exactly, and what a pose's covariance owes to them.
 
 They are consider parameters (Schmidt, 1966; Tapley, Schutz and Born, Statistical Orbit Determination, 2004, chapter 6): not estimated with the pose,
-but counted in its covariance. Each is in units of `calibration_scales`, the standard deviation with which it is known of a camera of a kind: within
-half a percent of the focal lengths, a few pixels of registration, a percent of a depth.
+but counted in its covariance. Each is in units of `calibration_scales`, the standard deviation with which it is known (`Camera.sigmas`).
 
 0, 1  focal lengths fx, fy, of colour and depth          7   offset of inverse depth
 2, 3  principal point cx, cy, of both                    8   relative error of depth in the corners of the image, with the square of the radius
@@ -20,21 +19,22 @@ from trihedron.pipeline.core.registry import register_covariance
 from trihedron.pipeline.core.types import F64, Camera, Pose
 from trihedron.plugins.shared.calibration_error_kernels import calibration_moment
 
-FOCAL, CENTRE, REGISTRATION = 0.003, 0.0019, 0.0022  # of the focal length; of the image's width, twice
-INVERSE_DEPTH_PER_M, RADIAL = 0.002, 0.007
 CALIBRATION_NAMES = (
     "the focal length fx", "the focal length fy", "the principal point in x", "the principal point in y", "the focal length of depth",
     "the registration of depth in x", "the registration of depth in y", "inverse depth", "depth in the corners", "the readout of colour",
     "the delay of depth", "the readout of depth",
 )  # fmt: skip
-READOUT_S, DELAY_S, DEPTH_READOUT_S = 0.02, 0.012, 0.015
 
 
 def calibration_scales(camera: Camera) -> F64:
-    """Standard deviations (12,) with which the calibration of a camera of a kind is known: those of the ranges that are published or usual, as in
-    `datasets.simulation.sensor_models`."""
-    centre, shift = CENTRE * camera.width, REGISTRATION * camera.width
-    return np.array([FOCAL, FOCAL, centre, centre, FOCAL, shift, shift, INVERSE_DEPTH_PER_M, RADIAL, READOUT_S, DELAY_S, DEPTH_READOUT_S])
+    """Return the standard deviations (12,) with which the calibration of a camera is known: those that it states, by default the ranges that are
+    published or usual, as in `datasets.simulation.sensor_models`."""
+    known = camera.sigmas
+    centre, shift = known.centre * camera.width, known.registration * camera.width
+    return np.array([
+        known.focal, known.focal, centre, centre, known.depth_focal, shift, shift, known.inverse_depth, known.depth_radial,
+        known.readout_s, known.delay_s, known.depth_readout_s,
+    ])  # fmt: skip
 
 
 @register_covariance("calibration")

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from trihedron.pipeline.core.errors import TrihedronError
     from trihedron.pipeline.core.registry import register
     from trihedron.pipeline.core.types import (
+        CalibrationSigmas,
         Frame,
         Keypoints,
         LineSegments,
@@ -71,7 +72,8 @@ if TYPE_CHECKING:
     building: Slot
 
 _TYPES = (
-    "Frame", "Keypoints", "LineSegments", "ManhattanFrame", "Map", "Normals", "Planes", "Pose", "Rotation", "Segments", "Surface", "Translation",
+    "CalibrationSigmas", "Frame", "Keypoints", "LineSegments", "ManhattanFrame", "Map", "Normals", "Planes", "Pose", "Rotation", "Segments",
+    "Surface", "Translation",
 )  # fmt: skip
 _SLOTS = (
     "dataset", "normals", "keypoints", "lines", "segments", "planes", "manhattan", "tracks", "rotation", "translation", "matches", "pose", "map",
@@ -93,10 +95,10 @@ _HOMES = {
 }
 
 __all__ = [
-    "Building", "Camera", "Frame", "Keypoints", "LineSegments", "ManhattanFrame", "Map", "Normals", "Planes", "Pose", "Recording", "Rotation", "Run",
-    "Segments", "Slam", "Surface", "Trajectory", "Translation", "TrihedronError", "__version__", "ablate", "building", "bundle", "compare",
-    "dataset", "keypoints", "lines", "loop", "manhattan", "map", "matches", "model", "normals", "planes", "pose", "register", "relocalise",
-    "rotation", "run", "segments", "surface", "tracks", "translation",
+    "Building", "CalibrationSigmas", "Camera", "Frame", "Keypoints", "LineSegments", "ManhattanFrame", "Map", "Normals", "Planes", "Pose",
+    "Recording", "Rotation", "Run", "Segments", "Slam", "Surface", "Trajectory", "Translation", "TrihedronError", "__version__", "ablate", "building",
+    "bundle", "compare", "dataset", "keypoints", "lines", "loop", "manhattan", "map", "matches", "model", "normals", "planes", "pose", "register",
+    "relocalise", "rotation", "run", "segments", "surface", "tracks", "translation",
 ]  # fmt: skip
 
 

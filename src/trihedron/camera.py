@@ -24,6 +24,7 @@ class Camera(types.Camera):
         cy: principal point, px.
         fps: nominal frames per second.
         depth_noise: standard deviation of a depth reading; that of a Kinect by default.
+        sigmas: standard deviations with which the calibration is known, `trihedron.CalibrationSigmas`; those of a camera of a kind by default.
         depth_scale: value of a 16-bit depth image per metre, 1000 for millimetres; 0 where depth is given in metres.
         distortion: k1 k2 p1 p2 k3 of Brown's model, in OpenCV's order, of both images; empty for undistorted ones.
         depth_offset: added to inverse depths (1/m).
@@ -56,7 +57,7 @@ class Camera(types.Camera):
     @classmethod
     def from_yaml(cls, path: str | Path) -> Camera:
         """Read a camera file: `width height fx fy cx cy depth_scale [distortion] [fps] [depth_noise] [depth_offset]
-        [depth_radial] [depth_camera]`.
+        [depth_radial] [depth_camera] [sigmas]`.
 
         Args:
             path: the file, one `key: value` a line; ~ is the home folder.

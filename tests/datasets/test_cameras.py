@@ -9,7 +9,7 @@ import pytest
 
 from trihedron.datasets.readers.cameras import PRESETS, choose_calibration, read_camera_file
 from trihedron.pipeline.core.errors import DataError
-from trihedron.pipeline.core.types import EXACT_DEPTH, DepthNoise
+from trihedron.pipeline.core.types import EXACT_DEPTH, CalibrationSigmas, DepthNoise
 
 GOOD = "width: 640\nheight: 480\nfx: 500\nfy: 501.5\ncx: 320\ncy: 240\ndepth_scale: 1000\n"
 KEYS = "give width height fx fy cx cy depth_scale"
@@ -50,6 +50,13 @@ def test_depth_of_a_camera_file_is_corrected_and_registered(tmp_path: Path) -> N
     assert (found[:, 14] == 1.0).all() and (found[:, 16] == 2.0).all() and (found[:, 0] == 0.0).all() and np.count_nonzero(found[5] == 1.0) == 1
 
 
+def test_a_camera_file_states_how_well_its_calibration_is_known(tmp_path: Path) -> None:
+    (tmp_path / "camera.yaml").write_text(GOOD + "sigmas: {focal: 0.001, registration: 0}\n")
+    assert read_camera_file(tmp_path / "camera.yaml").camera.sigmas == CalibrationSigmas(focal=0.001, registration=0.0)
+    (tmp_path / "camera.yaml").write_text(GOOD)
+    assert read_camera_file(tmp_path / "camera.yaml").camera.sigmas == CalibrationSigmas()
+
+
 BAD = [
     (GOOD.replace("fx: 500\n", ""), "{}: the key 'fx' is missing; " + KEYS),
     (GOOD + "dept_scale: 5000\n", "{}: unknown key 'dept_scale'; did you mean 'depth_scale'?"),
@@ -71,6 +78,14 @@ BAD = [
     (GOOD + "depth_radial: 0.6\n", "{}: depth_radial is 0.6; give a relative error within ±0.5"),
     (GOOD + "depth_camera: 580\n", "{}: depth_camera holds no keys; give it fx fy cx cy translation_m rotation_deg"),
     (GOOD + "depth_camera: {fx: 580, fy: 580, cx: 320}\n", "{}: the key 'depth_camera.cy' is missing; give it fx fy cx cy"),
+    (
+        GOOD + "sigmas: 0.01\n",
+        "{}: sigmas holds no keys; give it some of focal centre depth_focal registration inverse_depth depth_radial readout_s delay_s "
+        "depth_readout_s",
+    ),
+    (GOOD + "sigmas: {focul: 0.01}\n", "{}: unknown key 'sigmas.focul'; did you mean 'focal'?"),
+    (GOOD + "sigmas: {focal: wide}\n", "{}: sigmas.focal is 'wide'; give a finite number"),
+    (GOOD + "sigmas: {focal: -0.01}\n", "{}: sigmas.focal is not within 0 … 1; give the numbers of a calibration, in pixels"),
     (
         GOOD + "depth_camera: {fx: 0, fy: 580, cx: 320, cy: 240}\n",
         "{}: depth_camera.fx is not within 0.001 … 1e+06; give the numbers of a calibration, in pixels",

@@ -13,7 +13,7 @@ import zstandard
 
 from trihedron.pipeline.core.errors import RecordingError
 from trihedron.pipeline.core.table import CHUNK, Column, Table
-from trihedron.pipeline.core.types import Camera, DepthNoise, Frame, Keypoints, Map, Planes, Pose, Rotation
+from trihedron.pipeline.core.types import CalibrationSigmas, Camera, DepthNoise, Frame, FrameReference, Keypoints, Map, Planes, Pose, Rotation
 from trihedron.pipeline.record.codec import Decoder, Encoder, LegacyMessage, builds_on
 from trihedron.pipeline.record.schemas import message_class
 from trihedron.pipeline.record.table_codec import CHECKPOINT_EVERY, MAX_CHECKPOINTS
@@ -57,6 +57,14 @@ def test_arrays_scalars_text_and_nested_values():
     none = np.empty((0, 3, 3))
     rotation = Rotation(1, 2, np.eye(3), np.eye(3), none, none, np.empty(0, np.int32), np.empty(0), "tracks")
     assert differing(rotation, there_and_back(rotation)) == []
+
+
+def test_a_nested_value_that_an_older_message_lacks_is_its_default():
+    camera = Camera(64, 48, 50.0, 51.0, 31.5, 23.5, sigmas=CalibrationSigmas(focal=0.0))
+    message = message_of(FrameReference(1, 2, camera))
+    assert there_and_back(FrameReference(1, 2, camera)).camera.sigmas.focal == 0.0
+    message.camera.ClearField("sigmas")
+    assert Decoder("file: topic /frames").decode(message.SerializeToString()).camera.sigmas == CalibrationSigmas()
 
 
 def test_large_arrays_of_every_element_type_and_shape():

@@ -7,7 +7,7 @@ import pytest
 
 from trihedron.pipeline.core.geometry import invert
 from trihedron.pipeline.core.lie import adjoint, exp_se3, log_se3
-from trihedron.pipeline.core.types import CALIBRATION, Camera, Pose
+from trihedron.pipeline.core.types import CALIBRATION, CalibrationSigmas, Camera, Pose
 from trihedron.plugins.pose.calibration_uncertainty import carried_calibration, contradicted_calibration
 from trihedron.plugins.shared.calibration_error import calibration_covariance, calibration_scales
 from trihedron.plugins.shared.calibration_error_kernels import (
@@ -52,6 +52,13 @@ def measured(points, plane, theta, twist):
         z = reading(on_plane / on_plane[2], radius2)
         seen[i] = z * np.append((at - [cx, cy]) / [fx, fy], 1.0)
     return pixels, depth, seen
+
+
+def test_a_camera_states_the_units_of_its_parameters():
+    given = CalibrationSigmas(0.001, 0.002, 0.003, 0.004, 0.005, 0.006, 0.007, 0.008, 0.009)
+    stated = calibration_scales(replace(CAMERA, sigmas=given))
+    assert stated == pytest.approx([0.001, 0.001, 1.28, 1.28, 0.003, 2.56, 2.56, 0.005, 0.006, 0.007, 0.008, 0.009])
+    assert calibration_scales(CAMERA) == pytest.approx([0.003, 0.003, 1.216, 1.216, 0.003, 1.408, 1.408, 0.002, 0.007, 0.02, 0.012, 0.015])
 
 
 def points_on(rng, plane, T_world_camera, count):
