@@ -64,10 +64,11 @@ def log_se3(T: F64) -> F64:
 
 def adjoint(T: F64) -> F64:
     """Return the adjoints (..., 6, 6) of (..., 4, 4) rigid motions: `T Exp(xi) T⁻¹ = Exp(Ad xi)`, translation first."""
-    R, t = T[..., :3, :3], T[..., :3, 3]
+    R, t = T[..., :3, :3], T[..., :3, 3, None]
     out = np.zeros((*T.shape[:-2], 6, 6))
     out[..., :3, :3] = out[..., 3:, 3:] = R
-    out[..., :3, 3:] = -np.cross(R, t[..., None], axisa=-2, axisb=-2, axisc=-2)
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):  # t × R; np.cross takes six times as long
+        out[..., i, 3:] = t[..., j, :] * R[..., k, :] - t[..., k, :] * R[..., j, :]
     return out
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -84,9 +84,16 @@ class MapAlignment:
     segments: Segments
     planes: Planes
     map: Map
+    made: dict[bytes, Terms] = field(default_factory=dict)  # pose -> terms
 
     def terms(self, T_world_camera: F64) -> Terms:
-        """All matches as terms; the extent of lines is that seen from a pose."""
+        """All matches as terms; the extent of lines is that seen from a pose. Those of one pose are made once."""
+        key = T_world_camera.tobytes()
+        if key not in self.made:
+            self.made[key] = self._terms(T_world_camera)
+        return self.made[key]
+
+    def _terms(self, T_world_camera: F64) -> Terms:
         map, matches = self.map, self.matches
         line_sigma_px = math.hypot(self.options.line_sigma_px, self.keypoints.blur_px)
         return (
