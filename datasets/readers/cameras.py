@@ -157,11 +157,7 @@ def _sigmas(path: Path, given: Any) -> CalibrationSigmas:
     if given is None:
         return CalibrationSigmas()
     known = tuple(field.name for field in fields(CalibrationSigmas))
-    if not isinstance(given, dict):
-        raise DataError(str(path), "sigmas holds no keys", f"give it some of {' '.join(known)}")
-    unknown = next((key for key in given if key not in known), None)
-    if unknown is not None:
-        raise DataError(str(path), f"unknown key 'sigmas.{_printable_value(unknown)}'", did_you_mean(_printable_value(unknown), known))
+    _check_keys(path, "sigmas", given, known, "give it some of")
     return CalibrationSigmas(**{key: _number(path, f"sigmas.{key}", value) for key, value in given.items()})
 
 
@@ -170,16 +166,21 @@ def _depth_camera(path: Path, given: Any) -> DepthCamera | None:
     if given is None:
         return None
     known = tuple(field.name for field in fields(DepthCamera))
-    if not isinstance(given, dict):
-        raise DataError(str(path), "depth_camera holds no keys", f"give it {' '.join(known)}")
-    unknown = next((key for key in given if key not in known), None)
-    if unknown is not None:
-        raise DataError(str(path), f"unknown key 'depth_camera.{_printable_value(unknown)}'", did_you_mean(_printable_value(unknown), known))
+    _check_keys(path, "depth_camera", given, known, "give it")
     missing = next((key for key in known[:4] if key not in given), None)
     if missing is not None:
         raise DataError(str(path), f"the key 'depth_camera.{missing}' is missing", f"give it {' '.join(known[:4])}")
     fx, fy, cx, cy = (_number(path, f"depth_camera.{key}", given[key]) for key in known[:4])
     return DepthCamera(fx, fy, cx, cy, *(_three(path, f"depth_camera.{key}", given.get(key)) for key in known[4:]))
+
+
+def _check_keys(path: Path, name: str, given: Any, known: tuple[str, ...], cure: str) -> None:
+    """Raise DataError where what is given is no mapping, or has a key that is not known."""
+    if not isinstance(given, dict):
+        raise DataError(str(path), f"{name} holds no keys", f"{cure} {' '.join(known)}")
+    unknown = next((key for key in given if key not in known), None)
+    if unknown is not None:
+        raise DataError(str(path), f"unknown key '{name}.{_printable_value(unknown)}'", did_you_mean(_printable_value(unknown), known))
 
 
 def _three(path: Path, key: str, given: Any) -> tuple[float, float, float]:
