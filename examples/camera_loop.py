@@ -27,6 +27,19 @@ Images: TypeAlias = Iterator[tuple[Any, Any, float]]  # RGB, registered depth, s
 Source: TypeAlias = AbstractContextManager[tuple[Any, Images]]  # the camera, and its images for as long as it sends them
 
 
+class NoCamera(Exception):
+    """The camera does not start."""
+
+
+@contextmanager
+def starting() -> Iterator[None]:
+    """Say in one line that a camera does not start, of which the makers' libraries raise RuntimeError."""
+    try:
+        yield
+    except RuntimeError as error:
+        raise NoCamera(f"the camera does not start: {error}; plug it in, or try another port") from error
+
+
 @contextmanager
 def replay(dataset: Any) -> Iterator[tuple[Any, Images]]:
     """A data set in the place of a camera: depth in metres."""
@@ -42,7 +55,8 @@ def realsense() -> Iterator[tuple[Any, Images]]:
     config, pipeline, align = rs.config(), rs.pipeline(), rs.align(rs.stream.color)
     config.enable_stream(rs.stream.color, WIDTH, HEIGHT, rs.format.rgb8, FPS)
     config.enable_stream(rs.stream.depth, WIDTH, HEIGHT, rs.format.z16, FPS)
-    profile = pipeline.start(config)
+    with starting():
+        profile = pipeline.start(config)
     intrinsics = profile.get_stream(rs.stream.color).as_video_stream_profile().get_intrinsics()
     scale = 1.0 / profile.get_device().first_depth_sensor().get_depth_scale()
     distortion = tuple(intrinsics.coeffs) if any(intrinsics.coeffs) else ()
@@ -76,7 +90,9 @@ def oak() -> Iterator[tuple[Any, Images]]:
     """An OAK-D; the device undistorts colour and registers its stereo depth (mm) to it."""
     import depthai as dai
 
-    with dai.Pipeline() as pipeline:
+    with starting():
+        made = dai.Pipeline()
+    with made as pipeline:
         node = pipeline.create(dai.node.RGBD).build(True, size=(WIDTH, OAK_HEIGHT), fps=float(FPS))
         queue = node.rgbd.createOutputQueue(maxSize=1, blocking=False)  # the newest pair
         pipeline.start()
@@ -128,7 +144,7 @@ def command(*words: str) -> None:
         main(*(word for word in words if not word.startswith("out=")), **({"out": out[-1]} if out else {}))
     except ModuleNotFoundError as error:
         sys.exit(f"camera_loop: {error.name}: is not installed; install it with: {MAKERS.get(error.name or '', f'pip install {error.name}')}")
-    except (th.TrihedronError, ImportError) as error:
+    except (th.TrihedronError, ImportError, NoCamera) as error:
         sys.exit(f"camera_loop: {error}")
 
 

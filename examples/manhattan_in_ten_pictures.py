@@ -1,6 +1,7 @@
 """Draw the ten pictures of docs/explanation/manhattan-frames.md.
 
-python examples/manhattan_in_ten_pictures.py docs/explanation/manhattan
+python examples/manhattan_in_ten_pictures.py            # into runs/manhattan
+python examples/manhattan_in_ten_pictures.py FOLDER
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ import trihedron as th
 FRAME, COLORS = 20, ("tab:red", "tab:green", "tab:blue")
 
 
-def main(folder: str) -> None:
+def main(folder: str = "runs/manhattan") -> None:
     out = Path(folder)
     out.mkdir(parents=True, exist_ok=True)
     dataset = th.dataset.synthetic()

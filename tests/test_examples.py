@@ -10,6 +10,7 @@ from datetime import timedelta
 from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
+from unittest.mock import MagicMock
 
 import cv2
 import numpy as np
@@ -90,6 +91,19 @@ def test_camera_loop_names_a_missing_library_and_its_cure(monkeypatch, program, 
     with pytest.raises(SystemExit) as caught:
         runpy.run_path(str(EXAMPLES / f"{program}.py"), run_name="__main__")
     assert str(caught.value) == f"camera_loop: {line}"
+
+
+def test_camera_loop_says_in_one_line_that_no_camera_is_there(monkeypatch):
+    def fail(*_):
+        raise RuntimeError("No device connected")
+
+    library = MagicMock()
+    library.pipeline.return_value.start = library.Pipeline = fail
+    for name, source in (("pyrealsense2", "realsense"), ("depthai", "oak")):
+        monkeypatch.setitem(sys.modules, name, library)
+        with pytest.raises(SystemExit) as caught:
+            example("camera_loop").command(source)
+        assert str(caught.value) == "camera_loop: the camera does not start: No device connected; plug it in, or try another port"
 
 
 def test_camera_loop_writes_where_it_is_told(monkeypatch):

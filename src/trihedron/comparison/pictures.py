@@ -15,12 +15,16 @@ if TYPE_CHECKING:
 SIZE_INCHES, DPI = (16, 6.4), 120  # 1920 × 768 px
 FRAMED = (0.5, 99.5)  # percentiles of the landmarks between two edges of the map, which holds 98 % of them
 MARGIN_M = 0.2
+FEATURES = {"planes": "planes", "segments": "3D lines", "keypoints": "key points", "manhattan": "Manhattan axes"}  # topic -> what is drawn of it
+PAD_INCHES = 0.15  # round axes, whose labels an equal aspect moves
 PAIR_COLORS = ("#0072b2", "#d55e00")  # of two runs; distinguishable for the colour-blind (Okabe and Ito)
 
 
 def draw(path: str, frame: int, out: Path) -> None:
-    """Image with features left, map from above right. Raises RecordingError when the recording lacks poses or the frame."""
+    """Image with features left, map from above right; the title names what the recording holds of the former. Raises RecordingError when it lacks
+    poses or the frame."""
     from matplotlib.figure import Figure
+    from matplotlib.layout_engine import ConstrainedLayoutEngine
 
     from trihedron.pipeline.app.recorded_values import open_recording
     from trihedron.pipeline.core.errors import RecordingError
@@ -33,11 +37,11 @@ def draw(path: str, frame: int, out: Path) -> None:
     frame = numbers[len(numbers) // 2] if frame < 0 else frame
     if frame not in numbers:
         raise RecordingError(path, f"has no frame {frame}", f"give one of {numbers[0]}..{numbers[-1]}")
-    figure = Figure(figsize=SIZE_INCHES, layout="constrained")
+    figure = Figure(figsize=SIZE_INCHES, layout=ConstrainedLayoutEngine(h_pad=PAD_INCHES))
     left, right = figure.subplots(1, 2, width_ratios=[4, 3])
     left.imshow(_annotate_frame([recording], frame))
     left.set_axis_off()
-    left.set_title(f"frame {frame}: planes, 3D lines, key points, Manhattan axes", fontsize=10)
+    left.set_title(f"frame {frame}: {_contents(recording)}", fontsize=10)
     _map_from_above(right, recording, poses)
     with new_file(out) as new:
         figure.savefig(new, dpi=DPI)
@@ -95,8 +99,7 @@ def _annotate_frame(recordings: Sequence[Recording], frame: int) -> Any:
     assert reference is not None, "the frame is one of the recording's"
     camera = reference.camera
     image = _image(recordings[-1], reference.stamp_ns, camera)
-    topics = ("planes", "segments", "keypoints", "manhattan")
-    values: dict[str, Any] = {topic: _value(recordings, topic, reference.stamp_ns) for topic in topics}
+    values: dict[str, Any] = {topic: _value(recordings, topic, reference.stamp_ns) for topic in FEATURES}
     if values["planes"] is not None:
         image = tint_planes(image, values["planes"])
     if values["segments"] is not None:
@@ -106,6 +109,13 @@ def _annotate_frame(recordings: Sequence[Recording], frame: int) -> Any:
     if values["manhattan"] is not None and values["manhattan"].supported:
         draw_axes(image, values["manhattan"].rotations[0])
     return image
+
+
+def _contents(recording: Recording) -> str:
+    """Say which features a recording has, and if it has no images, as that of a run over recorded features."""
+    features = ", ".join(name for topic, name in FEATURES.items() if topic in recording.topics) or "no features"
+    seen = "dataset" in recording.topics or "/view/image" in recording.channels
+    return features if seen else f"{features}; the recording holds no images"
 
 
 def _image(recording: Recording, stamp_ns: int, camera: Camera) -> Any:
