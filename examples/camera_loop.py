@@ -27,17 +27,13 @@ Images: TypeAlias = Iterator[tuple[Any, Any, float]]  # RGB, registered depth, s
 Source: TypeAlias = AbstractContextManager[tuple[Any, Images]]  # the camera, and its images for as long as it sends them
 
 
-class NoCamera(Exception):
-    """The camera does not start."""
-
-
 @contextmanager
 def starting() -> Iterator[None]:
-    """Say in one line that a camera does not start, of which the makers' libraries raise RuntimeError."""
+    """Make one line of a camera that does not start, for which the makers' libraries raise RuntimeError."""
     try:
         yield
     except RuntimeError as error:
-        raise NoCamera(f"the camera does not start: {error}; plug it in, or try another port") from error
+        raise th.TrihedronError("the camera does not start", str(error), "plug it in, or try another port") from error
 
 
 @contextmanager
@@ -144,7 +140,7 @@ def command(*words: str) -> None:
         main(*(word for word in words if not word.startswith("out=")), **({"out": out[-1]} if out else {}))
     except ModuleNotFoundError as error:
         sys.exit(f"camera_loop: {error.name}: is not installed; install it with: {MAKERS.get(error.name or '', f'pip install {error.name}')}")
-    except (th.TrihedronError, ImportError, NoCamera) as error:
+    except (th.TrihedronError, ImportError) as error:
         sys.exit(f"camera_loop: {error}")
 
 

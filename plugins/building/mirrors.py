@@ -193,6 +193,7 @@ def _crossing(readings: UprightReadings, space: FreeSpace, storey: Storey, face:
     read = face.count[np.clip(column, 0, len(face.count) - 1), np.clip(level, 0, LEVELS - 1)] >= LEAST_READINGS
     inside = ~(read & (column >= 0) & (column < len(face.count)))
     rays, along, height, before = rays[inside], along[inside], height[inside], (away > 0.0)[readings.rows]
+    in_front = before & (off > 0.0)
     facing = matmul(normals[rays, :2], normal)
     column = np.floor((along_face[rays] - face.start_m) / CELL_M).astype(int)
     reached = sliding_sum(np.pad(face.count.any(axis=1), REACH).astype(np.float64), np.ones(2 * REACH + 1)) > 0.0
@@ -203,9 +204,9 @@ def _crossing(readings: UprightReadings, space: FreeSpace, storey: Storey, face:
     reflected, turned = through.copy(), turned.copy()
     reflected[:, :2] -= 2.0 * off[rays[judged], None] * normal
     turned[:, :2] -= 2.0 * facing[judged, None] * normal
-    repeats = _is_read(reflected, turned, readings, before & (off > 0.0))
+    repeats = _is_read(reflected, turned, readings, in_front)
     left = np.nonzero(~repeats & ~real)[0]
-    left = left[~_is_read(reflected[left], -turned[left], readings, before & (off > 0.0))]
+    left = left[~_is_read(reflected[left], -turned[left], readings, in_front)]
     around = [*(step * turned[left] for step in range(-2, 3)), np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, -1.0])]
     free = np.all([space.passed(reflected[left] + SAME_M * step, storey.bottom_m) for step in around], axis=0)
     against = real & ~repeats
