@@ -17,7 +17,7 @@ from trihedron.datasets.readers.sequence import clip_range
 from trihedron.pipeline.core.errors import DataError, did_you_mean
 from trihedron.pipeline.core.options import Frames, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, Share
 from trihedron.pipeline.core.registry import plugin_class, register
-from trihedron.pipeline.core.types import F32, U8, Camera, Frame, Trajectory
+from trihedron.pipeline.core.types import F32, U8, CalibrationSigmas, Camera, Frame, Trajectory
 
 
 class Covered(Enum):
@@ -44,7 +44,7 @@ EACH, ALL, SHUFFLED = 5, 6, 9  # streams of random numbers: one a frame, one for
 @dataclass(frozen=True)
 class Faults:
     """The data set `of` as a bad day would deliver it. Frames are numbered as they arrive; ranges are of the numbers in the data set underneath.
-    What is random depends on the seed and the frame alone."""
+    What is random depends on the seed and the frame alone. Its camera states the default `sigmas`, as faults are of the calibration, too."""
 
     frames: Frames = ""  # part to read, half open: A:B, A:, :B, every S-th A:B:S; empty = all
     of: str = "synthetic"  # the data set underneath
@@ -104,7 +104,7 @@ class Faults:
         if number % self.depth_every and (slow := self._inner(number - number % self.depth_every)) is not None:
             frame = replace(frame, depth_m=slow.depth_m)
         color, depth, camera = self._cover_images(number, *self._spoilt(shown, frame))
-        return Frame(arrived, self._delivery.stamp_ns(timed.stamp_ns, number), color, depth, camera)
+        return Frame(arrived, self._delivery.stamp_ns(timed.stamp_ns, number), color, depth, replace(camera, sigmas=CalibrationSigmas()))
 
     def truth(self) -> Trajectory | None:
         """That of the data set underneath, at the true times."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from enum import Enum
 from functools import cache, cached_property, lru_cache
 from typing import Annotated
@@ -28,7 +28,7 @@ from trihedron.datasets.simulation.true_surface import TrueSurface, surface_of
 from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.options import Frames, NonNegativeInt, PositiveFloat, Range
 from trihedron.pipeline.core.registry import register
-from trihedron.pipeline.core.types import EXACT_DEPTH, F32, F64, I32, U8, Bool, Camera, Frame, Trajectory
+from trihedron.pipeline.core.types import EXACT_DEPTH, F32, F64, I32, U8, Bool, CalibrationSigmas, Camera, Frame, Trajectory
 
 
 class Scene(Enum):
@@ -63,6 +63,7 @@ FLATS: dict[Scene, Callable[[int], Building]] = {Scene.random_flat: random_flat,
 SENSORS = {Sensor.kinect: KINECT, Sensor.stereo: STEREO}
 ROOM_FRAMES = 150  # of the room, whose walk never ends
 FOCAL_PER_WIDTH = 525.0 / 640.0  # a Kinect's nominal colour camera
+EXACT_CALIBRATION = CalibrationSigmas(*(0.0,) * len(fields(CalibrationSigmas)))
 
 
 @register("dataset", "synthetic")
@@ -185,7 +186,7 @@ class Synthetic:
     def _camera(self) -> Camera:
         focal = FOCAL_PER_WIDTH * self.width
         noise = SENSORS[self.sensor].noise if self.noise else EXACT_DEPTH
-        return Camera(self.width, self.height, focal, focal, (self.width - 1) / 2.0, (self.height - 1) / 2.0, self.fps, noise)
+        return Camera(self.width, self.height, focal, focal, (self.width - 1) / 2.0, (self.height - 1) / 2.0, self.fps, noise, EXACT_CALIBRATION)
 
     @cached_property
     def _scene(self) -> tuple[Geometry, Atlas]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict
 from itertools import pairwise
 from typing import Any
 
@@ -247,3 +248,7 @@ def test_exact_depth_says_so() -> None:
     assert exact.camera.depth_noise == EXACT_DEPTH and noisy.camera.depth_noise == DepthNoise()
     assert (exact.depth_m > 0).all()
     assert exact.camera.fx == pytest.approx(52.5)
+
+
+def test_its_camera_is_exact_and_says_so():
+    assert set(asdict(Synthetic(width=64, height=48)(0).camera.sigmas).values()) == {0.0}
