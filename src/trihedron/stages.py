@@ -121,7 +121,7 @@ class Stage:
     """A plugin with its options that is called on arrays, frames and values.
 
     `stage(depth, camera)`, `stage(rgb, depth, camera)` or `stage(frame)`, then any inputs of the slot: by their names, as `normals=normals`, or by
-    their types alone. What is missing and cannot be None is computed by the default plugin of its slot, which is printed once.
+    their types alone. What is missing and cannot be None is computed by the default plugin of its slot, which is printed once for each stage.
 
     Examples:
         >>> import trihedron as th

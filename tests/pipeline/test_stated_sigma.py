@@ -81,13 +81,17 @@ def test_shares_of_a_stranger_have_no_cause(share):
     assert dominant_cause({"share": share}) == ""
 
 
-def test_a_run_says_it_beside_its_statuses(tmp_path, capsys):
+@pytest.mark.parametrize(
+    ("data", "exact"), [(("synthetic", "dataset."), True), (("faults", "+dataset.options."), False)], ids=["exact camera", "nominal camera"]
+)
+def test_a_run_says_it_beside_its_statuses(tmp_path, capsys, data, exact):
     """On the console, in metrics.json and in the report."""
-    out = tmp_path / "run"
-    assert main(["run", "dataset=synthetic", "dataset.length=12", "dataset.width=320", "dataset.height=240", f"out={out}"]) == 0
+    out, (kind, option) = tmp_path / "run", data
+    assert main(["run", f"dataset={kind}", f"{option}length=12", f"{option}width=320", f"{option}height=240", f"out={out}"]) == 0
     lines, sigma = capsys.readouterr().out.splitlines(), json.loads((out / "metrics.json").read_text())["sigma"]
     assert lines[0] == "frames: 12 ok" and lines[1] == sigma_line(sigma, out)
-    assert sigma["poses"] == 11 and sigma["share"]["calibration"] > 0.01 and sum(sigma["share"].values()) == pytest.approx(1.0)
+    assert sigma["poses"] == 11 and sum(sigma["share"].values()) == pytest.approx(1.0)
+    assert sigma["share"]["calibration"] == 0.0 if exact else sigma["share"]["calibration"] > 0.01
     assert 0.0 < sigma["median_m"] <= sigma["worst_m"] < 0.02 and 0.0 < sigma["median_deg"] <= sigma["worst_deg"] < 1.0
     assert main(["report", str(out), "--out", str(tmp_path / "page.html")]) == 0
     page = (tmp_path / "page.html").read_text()

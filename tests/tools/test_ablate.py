@@ -328,6 +328,30 @@ def test_mistakes_are_one_line(tmp_path, capsys, monkeypatch, words, code, messa
     assert capsys.readouterr().err.splitlines()[-1] == f"trihedron: {message}"
 
 
+def test_a_folder_holds_the_ablations_of_one_recording(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    record = ["run", "dataset.length=4", "dataset.width=160", "dataset.height=120", "threads=1"]
+    for name in ("first", "second"):
+        assert main([*record, f"out={name}"]) == 0
+    assert main(["ablate", "first", "manhattan=plane_svd", "out=found"]) == 0
+    before, _ = Path("found/ablation.json").read_bytes(), capsys.readouterr()
+    for words in (["manhattan=plane_svd"], ["bundle=none", "--dry-run"]):
+        assert main(["ablate", "second", *words, "out=found"]) == 1
+        cure = "give another out=DIR, or remove it"
+        assert capsys.readouterr().err.splitlines()[-1] == f"trihedron: found: holds the ablation of first/run.mcap; {cure}"
+    assert Path("found/ablation.json").read_bytes() == before
+    assert main(["ablate", "first", "bundle=none", "out=found"]) == 0
+    assert "found: keeps what it holds of this recording besides: manhattan=plane_svd\n" in capsys.readouterr().err
+    assert {tuple(one["swaps"]) for one in json.loads(Path("found/ablation.json").read_text()).values()} == {
+        ("manhattan=plane_svd",),
+        ("bundle=none",),
+    }
+    assert main([*record, "dataset.seed=1", "out=first"]) == 0  # anew: what is known of it is of another recording now
+    assert main(["ablate", "first", "bundle=none", "out=found"]) == 0
+    assert "keeps" not in capsys.readouterr().err
+    assert [one["swaps"] for one in json.loads(Path("found/ablation.json").read_text()).values()] == [["bundle=none"]]
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_a_wrong_sign_in_translation_is_attributed_to_translation(tmp_path, capsys, faulty):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -100,6 +100,9 @@ def ablate(options: Options) -> list[Case]:
     known, keys, cases = known_cases(options.out), [], []
     for number, work in enumerate(works_of(options, known), 1):
         recording = work.computing.recording
+        for key, other in known.items():
+            if key != work.key and _is_of(other, recording):
+                print(f"{options.out}: keeps what it holds of this recording besides: {' '.join(other.get('swaps', []))}", file=sys.stderr)
         if work.errors is not None:
             print(f"{recording.path}: done already", file=sys.stderr)
             case = tables.case_from_dict(known[work.key])
@@ -113,7 +116,7 @@ def ablate(options: Options) -> list[Case]:
             if options.budget:
                 case.budget, case.remarks = _budget(recording)
             write_errors(errors_file(options.out, work.key), [variant.errors for variant in case.variants])
-        case.swaps, case.feedback = list(options.swaps), options.feedback.name
+        case.swaps, case.feedback, case.recorded = list(options.swaps), options.feedback.name, _state(recording.path)
         cases.append(case)
         keys.append(work.key)
         _write(options.out, {**known, **dict(zip(keys, map(tables.case_to_dict, cases)))})
@@ -133,7 +136,26 @@ def works_of(options: Options, known: Mapping[str, Any]) -> Iterator[Work]:
         computing = Alternatives(recording, alternatives, options.feedback, options.threads)
         key = _key(recording, computing, options)
         errors = read_errors(errors_file(options.out, key), len(combinations)) if key in known else None
-        yield Work(computing, combinations, prefix, [options.out / folder_name(prefix, combination) for combination in combinations], key, errors)
+        folders = [options.out / folder_name(prefix, combination) for combination in combinations]
+        _check_folders(options.out, folders, recording, known.values())
+        yield Work(computing, combinations, prefix, folders, key, errors)
+
+
+def _check_folders(out: Path, folders: Sequence[Path], recording: Recording, known: Iterable[Mapping[str, Any]]) -> None:
+    """Raise DataError where the folders hold alternatives of another recording."""
+    for case in known:
+        if not _is_of(case, recording) and not {str(folder) for folder in folders}.isdisjoint(one["folder"] for one in case["variants"]):
+            raise DataError(str(out), f"holds the ablation of {case['recording']}", "give another out=DIR, or remove it")
+
+
+def _is_of(case: Mapping[str, Any], recording: Recording) -> bool:
+    return Path(case["recording"]).resolve() == recording.path.resolve()
+
+
+def _state(recording: Path) -> str:
+    """Size and time of a recording, which change when it is made anew."""
+    found = recording.stat()
+    return f"{found.st_size} {found.st_mtime_ns}"
 
 
 def _prefixes(paths: Sequence[Path]) -> list[str]:
@@ -146,16 +168,21 @@ def _prefixes(paths: Sequence[Path]) -> list[str]:
 
 def _key(recording: Recording, computing: Alternatives, options: Options) -> str:
     """Hash of all that the figures depend on."""
-    state = recording.path.stat()
-    parts = [str(recording.path.resolve()), state.st_size, state.st_mtime_ns, options.feedback.name, options.budget]
+    parts = [str(recording.path.resolve()), _state(recording.path), options.feedback.name, options.budget]
     configs = [key_of(alternative.config) for alternative in computing.alternatives]
     return hashlib.sha256(json.dumps([*parts, *configs, str(options.out.resolve())]).encode()).hexdigest()
 
 
 def known_cases(out: Path) -> Mapping[str, Any]:
-    """Return the cases that are in an ablation's folder already, by key; those of which a run folder is missing are left out."""
+    """Return the cases that are in an ablation's folder already, by key, without those of which a run folder is missing or the recording was made
+    anew."""
     known = read_results(out / RESULT)
-    return {key: case for key, case in known.items() if all(Path(one["folder"]).is_dir() for one in case["variants"])}
+    return {key: case for key, case in known.items() if all(Path(one["folder"]).is_dir() for one in case["variants"]) and not _is_stale(case)}
+
+
+def _is_stale(case: Mapping[str, Any]) -> bool:
+    path = Path(case["recording"])
+    return bool(case.get("recorded")) and path.exists() and case["recorded"] != _state(path)
 
 
 def _write(out: Path, cases: Mapping[str, Any]) -> None:

@@ -79,6 +79,7 @@ class Case:
     fps: float = 30.0
     swaps: list[str] = field(default_factory=list)  # the words that the alternatives were made of
     feedback: str = Feedback.new.name
+    recorded: str = ""  # size and time of the recording
     true: bool = True  # the poses by which single stages are measured are the ground truth, not those of the recorded run
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from trihedron.pipeline.core.files import new_file
 
 if TYPE_CHECKING:
-    from trihedron.pipeline.core.types import Camera, Map
+    from trihedron.pipeline.core.types import F64, Camera, Map
     from trihedron.pipeline.record.reader import Recording
 
 SIZE_INCHES, DPI = (16, 6.4), 120  # 1920 × 768 px
@@ -154,10 +154,9 @@ def _map_from_above(axes: Any, recording: Recording, poses: list[Any]) -> None:
     path = np.array([pose.T_world_camera[:3, 3] for pose in poses])
     shown = [path[:, [0, 2]]]
     if final is not None:
-        _landmarks(axes, final)
-        points = final.points.column("position_m")[final.points.column("alive")]
-        if len(points):
-            shown.append(np.percentile(points[:, [0, 2]], FRAMED, axis=0))
+        found = _draw_landmarks(axes, final)
+        if len(found):
+            shown.append(np.percentile(found[:, [0, 2]], FRAMED, axis=0))
     low, high = np.concatenate(shown).min(axis=0) - MARGIN_M, np.concatenate(shown).max(axis=0) + MARGIN_M
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     axes.plot(path[:, 0], path[:, 2], color="crimson", linewidth=2, label="camera")
@@ -168,14 +167,16 @@ def _map_from_above(axes: Any, recording: Recording, poses: list[Any]) -> None:
     axes.legend(loc="upper right", fontsize=8)
 
 
-def _landmarks(axes: Any, map: Map) -> None:
+def _draw_landmarks(axes: Any, map: Map) -> F64:
+    """Draw what is alive in the map; returns the points (n, 3) that it was drawn from."""
     import numpy as np
 
     points = map.points.column("position_m")[map.points.column("alive")]
     axes.scatter(points[:, 0], points[:, 2], s=1, color="0.6")
-    for ends in map.lines.column("endpoints_m")[map.lines.column("alive")]:
+    lines = map.lines.column("endpoints_m")[map.lines.column("alive")]
+    for ends in lines:
         axes.plot(ends[:, 0], ends[:, 2], color="tab:blue", linewidth=0.8)
-    alive = map.planes.column("alive")
-    for k, samples in enumerate(map.planes.column("samples_m")[alive]):
-        samples = samples[np.isfinite(samples[:, 0])]
+    planes = [samples[np.isfinite(samples[:, 0])] for samples in map.planes.column("samples_m")[map.planes.column("alive")]]
+    for k, samples in enumerate(planes):
         axes.scatter(samples[:, 0], samples[:, 2], s=10, marker="s", color=f"C{k % 10}")
+    return np.concatenate([points, lines.reshape(-1, 3), *planes])
