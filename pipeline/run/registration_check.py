@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
 
 import cv2
 import numpy as np
@@ -56,14 +55,17 @@ def depth_edges(depth_m: F32) -> NDArray[np.int64]:
     return np.concatenate([along_rows * [1, STRIDE], along_columns[:, ::-1] * [STRIDE, 1]])
 
 
-def _edges_along_rows(depth_m: NDArray[Any]) -> NDArray[np.int64]:
-    columns = np.arange(depth_m.shape[1], dtype=np.int32)
-    before = np.maximum.accumulate(np.where(depth_m > 0.0, columns, -1), axis=1)[:, :-1]  # the last reading
-    rows, right = np.nonzero((depth_m[:, 1:] > 0.0) & (before >= 0) & (columns[1:] - before <= WIDEST_GAP_PX))
-    left, right = before[rows, right], right + 1
-    a, b = depth_m[rows, left], depth_m[rows, right]
-    jumps = np.abs(a - b) > JUMP * np.minimum(a, b)
-    return np.asarray(np.stack([np.where(a < b, left, right), rows], axis=1)[jumps], np.int64)
+def _edges_along_rows(depth_m: F32) -> NDArray[np.int64]:
+    """(n, 2) column and row of the near sides. All readings are compared with the next one, and only jumps looked at closer."""
+    flat, width = depth_m.ravel(), depth_m.shape[1]
+    read = np.flatnonzero((flat > 0.0) & (flat < np.inf))
+    z = flat[read]
+    a, b = z[:-1], z[1:]
+    jumps = np.flatnonzero(np.abs(a - b) > JUMP * np.minimum(a, b))
+    left, right = read[jumps], read[jumps + 1]
+    near = (right - left <= WIDEST_GAP_PX) & (left // width == right // width)
+    nearer = np.where(a[jumps] < b[jumps], left, right)[near]
+    return np.stack([nearer % width, nearer // width], axis=1)
 
 
 def color_gradient(frame: Frame, blur_px: float) -> F32:

@@ -66,3 +66,13 @@ def test_depth_edges_are_on_the_near_side_across_shadows():
     found = depth_edges(depth)
     assert set(found[:, 0]) == {20, 29} and set(found[:, 1]) == set(range(0, 40, 2))
     assert len(depth_edges(np.full((40, 60), 3.0, np.float32))) == len(depth_edges(np.zeros((40, 60), np.float32))) == 0
+
+
+def test_edges_of_depth_are_on_the_near_side_of_a_jump_within_a_line():
+    depth = np.zeros((3, 32), np.float32)
+    depth[0, :16], depth[0, 16:] = 2.0, 3.0  # a step
+    depth[2, 4], depth[2, 16] = 2.0, 1.0  # across a shadow, at its widest
+    depth[2, 29] = 3.0  # beyond the widest
+    assert depth_edges(depth).tolist() == [[15, 0], [16, 2], [16, 2]]  # along rows, then columns
+    depth[0, 16:], depth[2, 16] = np.inf, np.nan  # no readings
+    assert depth_edges(depth).tolist() == []
