@@ -37,7 +37,7 @@ def main(argv: list[str]) -> int:
     from trihedron.pipeline.core.libraries import library_error
     from trihedron.pipeline.core.registry import load_plugins, plugins_of
     from trihedron.pipeline.record.reader import Recording
-    from trihedron.plugins.building.dxf import DXF
+    from trihedron.plugins.building.dxf import DXF, has_dxf
     from trihedron.plugins.building.files import GLB, JSON, write_building
     from trihedron.plugins.building.ifc import IFC, has_ifc, write_ifc
     from trihedron.plugins.building.pdf import PDF, write_pdf
@@ -63,7 +63,7 @@ def main(argv: list[str]) -> int:
             write_ifc(out / IFC, building)
     except OSError as error:
         raise DataError(str(error.filename or out), f"cannot be written: {error.strerror}", "give another --out FOLDER") from error
-    for file in (JSON, SVG, *((PDF,) if has_pdf else ()), DXF, GLB, *((IFC,) if has_ifc() else ())):
+    for file in (JSON, SVG, *((PDF,) if has_pdf else ()), *((DXF,) if has_dxf() else ()), GLB, *((IFC,) if has_ifc() else ())):
         print(f"  {out / file}")
     if not has_ifc():
         print(f"no {IFC}: {library_error('ifcopenshell')}")

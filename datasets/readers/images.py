@@ -7,12 +7,12 @@ from typing import Any
 
 import cv2
 import numpy as np
-from imagecodecs import png_decode
 from numpy.typing import NDArray
 
 from trihedron.datasets.readers.picture_headers import JPEG, PNG, UnreadableImage, picture_header, png_pixels
 from trihedron.pipeline.core.errors import DataError, printable
 from trihedron.pipeline.core.files import SHOWN, read_file
+from trihedron.pipeline.core.png_codec import decode_png
 from trihedron.pipeline.core.types import F32, U8
 
 RGB = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
@@ -91,18 +91,11 @@ def decode_image(data: bytes) -> NDArray[Any]:
     if (data.startswith(PNG) and pixels is None) or (data.startswith(JPEG) and JPEG_END not in data[-TAIL:]):
         raise UnreadableImage("is truncated")
     try:
-        image = _decode_png(pixels, header.channels) if pixels is not None else _decode_opencv(data, header.channels)
+        image = decode_png(pixels, header.channels) if pixels is not None else _decode_opencv(data, header.channels)
     except Exception as error:  # the decoders' own, and UnicodeDecodeError where libpng quotes a damaged name
         raise UnreadableImage(f"is damaged ({printable(str(error), SHOWN)})") from error
     if image is None or image.shape[:2] != (header.height, header.width):
         raise UnreadableImage("is damaged or of an unknown format")
-    return image
-
-
-def _decode_png(data: bytes, channels: int) -> NDArray[Any]:
-    image = np.asarray(png_decode(data))
-    if image.ndim == 3 and image.shape[2] == 2:  # grey with opacity, or with one value that counts as transparent
-        return image[..., [0, 0, 0, 1]] if channels == 2 else image[..., 0]
     return image
 
 

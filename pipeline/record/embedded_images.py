@@ -11,13 +11,13 @@ import zlib
 from collections.abc import Iterator
 from typing import Any
 
-import imagecodecs
 import numpy as np
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.timestamp_pb2 import Timestamp
 
 from trihedron.pipeline.core.errors import RecordingError, printable
+from trihedron.pipeline.core.png_codec import decode_png, pack
 from trihedron.pipeline.core.types import F32, U8, Frame, FrameReference
 from trihedron.pipeline.record.mcap_file import max_plain_bytes
 
@@ -27,7 +27,6 @@ CAMERA = "camera"  # frame_id
 DEPTH_ENCODING = "32FC1"
 PNG = b"\x89PNG\r\n\x1a\n"
 UP = 2  # the filter of a row
-LEVEL = 1  # of libdeflate
 DAMAGED = "the file is damaged; record it again"
 _HEADER = struct.Struct(">II5B")  # width, height, bits, colour type (2: RGB), compression, filters, interlacing
 
@@ -64,8 +63,7 @@ def png(image: U8) -> bytes:
     rows[:, 0] = UP
     rows[0, 1:] = flat[0]
     np.subtract(flat[1:], flat[:-1], out=rows[1:, 1:])
-    packed = bytes(imagecodecs.deflate_encode(rows.tobytes(), level=LEVEL))
-    return PNG + _chunk(b"IHDR", _HEADER.pack(width, height, 8, 2, 0, 0, 0)) + _chunk(b"IDAT", packed) + _chunk(b"IEND", b"")
+    return PNG + _chunk(b"IHDR", _HEADER.pack(width, height, 8, 2, 0, 0, 0)) + _chunk(b"IDAT", pack(rows)) + _chunk(b"IEND", b"")
 
 
 def _chunk(kind: bytes, content: bytes) -> bytes:
@@ -77,7 +75,7 @@ def _color(message: Any) -> U8:
     width, height, *kind = _HEADER.unpack_from(message.data, len(PNG) + 8)
     if not message.data.startswith(PNG) or kind != [8, 2, 0, 0, 0] or 3 * width * height > max_plain_bytes(len(message.data)):
         raise ValueError("it is no PNG of three channels and eight bits")
-    return np.asarray(imagecodecs.png_decode(message.data), np.uint8).reshape(height, width, 3)
+    return np.asarray(decode_png(message.data, 3), np.uint8).reshape(height, width, 3)
 
 
 def _depth(message: Any) -> F32:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from trihedron.pipeline.core.files import new_file
+from trihedron.pipeline.core.libraries import imports_of
 from trihedron.pipeline.core.types import F64, OPENING_KINDS, Building
 from trihedron.plugins.building.dimensions import chains_of
 from trihedron.plugins.building.geometry import (
@@ -38,10 +40,16 @@ APART_M = 0.5  # the rows of dimensions from each other, and from the plan
 GAP_M = 3.5  # between storeys
 
 
+def has_dxf() -> bool:
+    """Say if ezdxf is installed."""
+    return find_spec("ezdxf") is not None
+
+
 def write_dxf(path: Path, building: Building) -> None:
-    """Write the plan as DXF R2010 in metres, with a layer for each of LAYERS."""
-    import ezdxf
-    from ezdxf import units
+    """Write the plan as DXF R2010 in metres, with a layer for each of LAYERS. Raises LibraryError where ezdxf is not installed."""
+    with imports_of("ezdxf"):
+        import ezdxf
+        from ezdxf import units
 
     document = ezdxf.filemanagement.new("R2010", setup=["linetypes", "styles"])
     document.units = units.M

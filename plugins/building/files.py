@@ -11,11 +11,12 @@ import numpy as np
 
 from trihedron.pipeline.core.descriptions import summary_of_building
 from trihedron.pipeline.core.files import write_file
+from trihedron.pipeline.core.libraries import library_error
 from trihedron.pipeline.core.linalg import norm
 from trihedron.pipeline.core.plan_areas import area_interval, area_sigma, edge_sigma, seen_share
 from trihedron.pipeline.core.registry import register_files
 from trihedron.pipeline.core.types import ELEMENTS, F64, OPENING_KINDS, SUPPORTS, Building
-from trihedron.plugins.building.dxf import DXF, write_dxf
+from trihedron.plugins.building.dxf import DXF, has_dxf, write_dxf
 from trihedron.plugins.building.edits import missing_edits
 from trihedron.plugins.building.geometry import CEILING, MODEL_COLORS, parts_of
 from trihedron.plugins.building.labels import LISTS, id_of, name_of, parse_edits, plain_edits, use_of
@@ -32,13 +33,15 @@ def write_run_files(out: Path, building: Building) -> list[str]:
 
 
 def write_building(out: Path, building: Building, name: str = "") -> list[str]:
-    """Write the files into a folder; returns a line that describes them, and one for each correction by hand that no element has. `name` is that of
-    the run, for the plan's title."""
+    """Write the files into a folder; returns a line that describes them, one for a file whose library is not installed, and one for each correction
+    by hand that no element has. `name` is that of the run, for the plan's title."""
     write_json(out / JSON, building)
     write_svg(out / SVG, building, name)
-    write_dxf(out / DXF, building)
     write_glb(out / GLB, building)
-    return [summary(building), *missing_edits(building)]
+    if has_dxf():
+        write_dxf(out / DXF, building)
+    missing = [] if has_dxf() else [f"no {DXF}: {library_error('ezdxf')}"]
+    return [summary(building), *missing, *missing_edits(building)]
 
 
 def summary(building: Building) -> str:

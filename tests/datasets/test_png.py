@@ -8,8 +8,14 @@ import numpy as np
 import pytest
 
 from trihedron.datasets.readers.images import UnreadableImage, decode_image
+from trihedron.pipeline.core import png_codec
 
 FILTERS = {"none": 0, "left": 1, "above": 2, "mean": 3, "Paeth": 4}
+
+
+@pytest.fixture(params=[True, False], ids=["imagecodecs", "opencv"], autouse=True)
+def library(request, monkeypatch):
+    monkeypatch.setattr(png_codec, "HAS_IMAGECODECS", request.param)
 
 
 def chunk(name, body):

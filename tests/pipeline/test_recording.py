@@ -20,6 +20,7 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from trihedron.datasets.simulation.synthetic import Synthetic
 from trihedron.pipeline.app.cli import main
+from trihedron.pipeline.core import png_codec
 from trihedron.pipeline.core.errors import RecordingError
 from trihedron.pipeline.core.geometry import rotation_from_quaternion
 from trihedron.pipeline.core.lie import exp_se3, exp_so3
@@ -408,7 +409,9 @@ def test_images_of_format_5_are_read_and_become_those_of_foxglove(tmp_path, caps
         (1, b"\x1d\x10", b"\x1d\x11", "frame 0: an image cannot be read: "),
     ],
 )
-def test_damaged_images_are_one_line(part, old, new, message):
+@pytest.mark.parametrize("has_imagecodecs", [True, False], ids=["imagecodecs", "opencv"])
+def test_damaged_images_are_one_line(part, old, new, message, has_imagecodecs, monkeypatch):
+    monkeypatch.setattr(png_codec, "HAS_IMAGECODECS", has_imagecodecs)
     frame = Synthetic(length=1, width=32, height=16)(0)
     parts = [one.SerializeToString() for _, one in messages_of(frame)]
     reference = FrameReference(0, 0, frame.camera)

@@ -20,7 +20,9 @@ from trihedron.pipeline.core.errors import LibraryError
 from trihedron.pipeline.core.registry import write_files_of
 from trihedron.pipeline.core.types import OPENING_KINDS, Building
 from trihedron.pipeline.record.writer import RecordingWriter
+from trihedron.plugins.building import dxf
 from trihedron.plugins.building.dimensions import chains_of
+from trihedron.plugins.building.files import write_building
 from trihedron.plugins.building.geometry import box_place
 from trihedron.plugins.building.legend import FIGURES
 from trihedron.plugins.building.pdf import write_pdf
@@ -243,6 +245,12 @@ def test_walls_that_were_not_seen_are_on_a_layer_of_their_own(tmp_path):
     (ring,) = space.query('LWPOLYLINE[layer=="A-WALL-UNSN"]')
     assert shapely.Polygon(ring.get_points("xy")).bounds == pytest.approx((3.0, 3.0, 3.5, 3.06), abs=0.002)
     assert len(space.query('LWPOLYLINE[layer=="A-WALL"]')) == 1  # the gap leads into the rooms
+
+
+def test_without_ezdxf_the_other_files_are_written_and_a_line_names_it(tmp_path, monkeypatch):
+    monkeypatch.setattr(dxf, "find_spec", lambda name: None)
+    assert write_building(tmp_path, two_rooms())[1:] == ["no floorplan.dxf: ezdxf: is not installed; install it with: pip install ezdxf"]
+    assert {file.name for file in tmp_path.iterdir()} == {"building.json", "floorplan.svg", "building.glb"}
 
 
 def test_a_plan_of_nothing_is_a_dxf(tmp_path):
