@@ -152,7 +152,7 @@ def test_a_byte_holds_2048_pixels_at_most(monkeypatch: pytest.MonkeyPatch) -> No
     """As many in every byte of the file are read; one row more is refused before anything decodes it, and so is what no camera has."""
     within = black(2048, 400, 400)
     assert len(within) == 400 and decode_image(within).shape == (400, 2048)
-    monkeypatch.setattr(images, "png_decode", lambda *_: pytest.fail("decoded"))
+    monkeypatch.setattr(images, "decode_png", lambda *_: pytest.fail("decoded"))
     for width, height, size in ((2048, 401, 400), (8192, 8193, 100_000)):
         with pytest.raises(UnreadableImage, match=f"^claims {width}×{height} pixels in {size} bytes$"):
             decode_image(black(width, height, size))
