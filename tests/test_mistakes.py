@@ -63,7 +63,7 @@ MISTAKES = [  # words of the command, exit code, what is said after "trihedron: 
     ("run load_map=small/run.mcap", 1, "small/run.mcap: is a recording, not a saved map; save one with: trihedron run save_map=FILE.mcap"),
     ("run save_map=nowhere/map.mcap", 1, "save_map: the folder {here}/nowhere does not exist; make it first"),
     ("run replay=junk.mcap", 1, f"junk.mcap: {MCAP}"),
-    ("run replay=small", 1, "small: cannot be read: Is a directory; give the path of an MCAP file"),
+    ("run replay=empty", 1, "empty/run.mcap: cannot be read: No such file or directory; give the path of an MCAP file"),
     ("run replay=small/run.mcap only=[posse]", 1, "only: this graph has no stage 'posse'; did you mean 'pose'?"),
     ("run replay=small/run.mcap dataset.frames=90:", 1, "small/run.mcap: has none of the frames '90:'; give another dataset.frames"),
     ("run replay=small/run.mcap save_map=x.mcap", 1, "save_map: a replay makes no map to go on from; save the map of the run itself"),

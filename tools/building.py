@@ -22,8 +22,6 @@ from trihedron.tools.arguments import Parser
 if TYPE_CHECKING:
     from trihedron.pipeline.core.types import Building
 
-RECORDING = "run.mcap"
-
 
 def main(argv: list[str]) -> int:
     """Run the command; returns the exit code. Raises DataError for a recording without poses, planes or frames, UsageError for wrong arguments."""
@@ -36,6 +34,7 @@ def main(argv: list[str]) -> int:
     options = parser.parse_args(argv)
     from trihedron.pipeline.core.libraries import library_error
     from trihedron.pipeline.core.registry import load_plugins, plugins_of
+    from trihedron.pipeline.record.mcap_file import RECORDING, recording_file
     from trihedron.pipeline.record.reader import Recording
     from trihedron.plugins.building.dxf import DXF, has_dxf
     from trihedron.plugins.building.files import GLB, JSON, write_building
@@ -46,7 +45,7 @@ def main(argv: list[str]) -> int:
     load_plugins()
     if options.plugin is not None and options.plugin not in plugins_of("building"):
         raise UsageError("building", f"there is no building '{options.plugin}'", did_you_mean(options.plugin, list(plugins_of("building"))))
-    path: Path = options.run / RECORDING if options.run.is_dir() else options.run
+    path = recording_file(options.run)
     out: Path = options.out or path.parent
     building = building_of(Recording(path), options.plugin, options.edits or "")
     if options.edits is None and _has_more_edits(out / JSON, building):

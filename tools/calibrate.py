@@ -59,8 +59,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("recording", metavar="RUN.mcap", type=Path)
     parser.add_argument("--out", metavar="CAMERA.yaml", type=Path, help="write a camera file with what is recommended")
     arguments = parser.parse_args(argv)
-    path: Path = arguments.recording
-    recording = Recording(path / "run.mcap" if path.is_dir() else path)
+    recording = Recording(arguments.recording)
     recorded = read_recording(recording)
     used = calibration_in_use(recording, recorded.camera)
     found = estimate(recorded)

@@ -17,9 +17,10 @@ import json
 from pathlib import Path
 from typing import Any
 
-from trihedron.comparison.surface_errors import FIGURES, RECORDING, SURFACE, WITHIN_M, evaluate_files
+from trihedron.comparison.surface_errors import FIGURES, SURFACE, WITHIN_M, evaluate_files
 from trihedron.pipeline.core.files import write_file
 from trihedron.pipeline.core.text_table import table
+from trihedron.pipeline.record.mcap_file import recording_file
 from trihedron.tools.arguments import Parser
 
 
@@ -32,7 +33,7 @@ def main(argv: list[str]) -> int:
     arguments = parser.parse_args(argv)
     mesh: Path = arguments.mesh / SURFACE if arguments.mesh.is_dir() else arguments.mesh
     truth: Path = arguments.truth or mesh.parent
-    figures = evaluate_files(mesh, truth / RECORDING if truth.is_dir() else truth)
+    figures = evaluate_files(mesh, recording_file(truth))
     if arguments.mesh.is_dir() and arguments.truth is None:
         write_file(arguments.mesh / FIGURES, json.dumps(figures, indent=2) + "\n")
     print(json.dumps(figures, indent=2) if arguments.json else report(figures))

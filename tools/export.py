@@ -18,10 +18,10 @@ from pathlib import Path
 
 from trihedron.pipeline.app.recorded_values import open_recording
 from trihedron.pipeline.core.errors import DataError, UsageError, did_you_mean
+from trihedron.pipeline.record.mcap_file import recording_file
 from trihedron.pipeline.record.reader import Recording
 from trihedron.tools.arguments import Parser
 
-RECORDING = "run.mcap"
 BY_ENDING = {"glb": "gltf", "rrd": "rerun"}  # endings of files that are given for the names of their formats
 OF_BUILDINGS = ("dxf", "ifc", "svg")  # formats of another command
 FLAGS = {"covariance": "with the covariance of each pose (tum)", "images": "in the colours of the images, not of the planes (png)"}
@@ -64,7 +64,7 @@ def main(argv: list[str]) -> int:
             able = ", ".join(format.name for format in formats().values() if flag in format.variants)
             raise UsageError("export", f"--{flag} is not for the format '{name}'", f"give --to {able}, or leave out --{flag}")
         chosen = chosen.variants[flag]
-    recording: Path = arguments.run / RECORDING if arguments.run.is_dir() else arguments.run
+    recording = recording_file(arguments.run)
     out: Path = arguments.out or recording.parent / chosen.file
     try:
         content = chosen.write(open_recording(recording), out)

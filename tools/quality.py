@@ -89,7 +89,7 @@ def quality_of_run(run: Path) -> Quality:
     from trihedron.pipeline.record.reader import Recording
     from trihedron.pipeline.run.stated_sigma import stated_sigma
 
-    recording = Recording(run / "run.mcap" if run.is_dir() else run)
+    recording = Recording(run)
     references = {reference.stamp_ns: reference for reference in references_of(recording).values()}
     trajectory, frame_of = trajectory_of(recording), frames_of(recording)
     posed = [row for row, stamp in enumerate(trajectory.stamps_ns.tolist()) if stamp in references]

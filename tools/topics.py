@@ -32,7 +32,7 @@ class Topic:
 def main(argv: list[str]) -> int:
     """Run the command; returns the exit code. Raises RecordingError for a file that is missing, cut off or no MCAP."""
     parser = Parser("topics", __name__)
-    parser.add_argument("file", metavar="FILE.mcap", type=Path)
+    parser.add_argument("file", metavar="FILE.mcap", type=Path, help="or the folder of a run")
     found = topics_of(parser.parse_args(argv).file)
     rows: list[list[str]] = [["topic", "schema", "messages", "first (s)", "last (s)", "bytes"]]
     for topic in found:
@@ -48,8 +48,8 @@ def topics_of(path: Path) -> list[Topic]:
     from trihedron.pipeline.record.mcap_file import McapFile, damaged_file_error, in_use
 
     file = McapFile(path)
-    if not file.complete and not in_use(path):
-        raise damaged_file_error(path)
+    if not file.complete and not in_use(file.path):
+        raise damaged_file_error(file.path)
     found: dict[int, Topic] = {}
     for channel, log_time, data in file.messages():
         topic = found.get(channel)

@@ -19,10 +19,9 @@ from typing import Any
 from trihedron.pipeline.app.recorded_values import open_recording
 from trihedron.pipeline.app.viewers import keep_serving
 from trihedron.pipeline.core.errors import RecordingError, UsageError
-from trihedron.pipeline.record.mcap_file import in_use
+from trihedron.pipeline.record.mcap_file import in_use, recording_file
 from trihedron.pipeline.record.reader import Recording
 from trihedron.tools.arguments import Parser
-from trihedron.tools.export import RECORDING
 
 POLL_S = 0.5  # between two readings of a recording that is being written
 
@@ -43,7 +42,7 @@ def main(argv: list[str]) -> int:
     arguments = parser.parse_args(argv)
     run: Path = arguments.run
     require_rerun()
-    path = run / RECORDING if run.is_dir() else run
+    path = recording_file(run)
     growing = in_use(path)  # asked first: a run may end meanwhile
     recording = open_recording(path, announce=False)
     if lacks_display() and not arguments.web:

@@ -12,7 +12,7 @@ from trihedron.pipeline.core.config import make_plugin
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.options import frame_range
 from trihedron.pipeline.core.types import Frame, FrameReference, Map, Pose, Trajectory, Value
-from trihedron.pipeline.record.mcap_file import in_use
+from trihedron.pipeline.record.mcap_file import in_use, recording_file
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.rescue import recover
 from trihedron.pipeline.run.accounting import Result
@@ -22,8 +22,9 @@ from trihedron.pipeline.run.results import final_trajectory
 
 
 def open_recording(path: Path, announce: bool = True) -> Recording:
-    """Open a recording; of one that is still being written, a copy of what the file holds so far, which a line on stderr says. Raises
-    RecordingError."""
+    """Open a recording, by its file or the folder of its run; of one that is still being written, a copy of what the file holds so far, which a line
+    on stderr reports. Raises RecordingError."""
+    path = recording_file(path)
     if not in_use(path):
         return Recording(path)
     with TemporaryDirectory(prefix="trihedron-") as folder:

@@ -36,6 +36,7 @@ from numpy.typing import NDArray
 from trihedron.pipeline.core.errors import RecordingError, printable
 from trihedron.pipeline.core.files import open_file
 
+RECORDING = "run.mcap"  # in the folder of a run
 FOOTER_BYTES = 9 + 20 + len(MCAP0_MAGIC)  # of the footer and the end mark
 MAX_INDEX_BYTES = 64 << 20  # of the summary at the end of the file
 MAX_CHUNK_BYTES = 1 << 30  # of one chunk, unpacked
@@ -66,20 +67,27 @@ class ChannelIndex:
         return len(self.log_times)
 
 
+def recording_file(path: Path | str) -> Path:
+    """Return the recording of the folder of a run, or the file itself."""
+    given = Path(path)
+    return given / RECORDING if given.is_dir() else given
+
+
 class McapFile:
-    """An MCAP file opened for reading; `complete` is False where it ends before its end mark: then its whole records can be read.
+    """An MCAP file opened for reading, of a run folder its recording; `complete` is False where it ends before its end mark: then its whole records
+    can be read.
 
     Raises RecordingError when the file is missing or no MCAP file."""
 
     def __init__(self, path: Path | str) -> None:
-        self.path = Path(path)
+        self.path = recording_file(path)
         try:
             self._file = open_file(self.path)
             self._size = os.fstat(self._file.fileno()).st_size
         except OSError as error:
-            raise RecordingError(str(path), f"cannot be read: {error.strerror}", "give the path of an MCAP file") from error
+            raise RecordingError(str(self.path), f"cannot be read: {error.strerror}", "give the path of an MCAP file") from error
         if not self._size or self._bytes(0, min(len(MCAP0_MAGIC), self._size)) != MCAP0_MAGIC:
-            raise damaged_file_error(path)
+            raise damaged_file_error(self.path)
         self.channels: dict[int, Channel] = {}
         self.schemas: dict[int, Schema] = {}
         self.metadata: dict[str, dict[str, str]] = {}

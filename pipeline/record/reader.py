@@ -20,11 +20,11 @@ from trihedron.pipeline.record.mcap_file import McapFile, damaged_file_error
 
 
 class Recording:
-    """A recording opened for reading. Raises RecordingError when it is missing, damaged or not ours."""
+    """A recording opened for reading, by its file or the folder of its run. Raises RecordingError when it is missing, damaged or not ours."""
 
     def __init__(self, path: Path | str) -> None:
-        self.path = Path(path)
-        self._file = McapFile(self.path)
+        self._file = McapFile(path)
+        self.path = self._file.path
         if not self._file.complete or not self._file.indexed:
             raise damaged_file_error(self.path)
         if METADATA not in self._file.metadata:

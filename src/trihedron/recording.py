@@ -14,6 +14,7 @@ from trihedron.pipeline.core.errors import RecordingError, UsageError, did_you_m
 from trihedron.pipeline.core.types import Frame, Map, Pose, Surface, Value
 from trihedron.pipeline.record import reader
 from trihedron.pipeline.record.codec import FRAMES_TOPIC
+from trihedron.pipeline.record.mcap_file import recording_file
 from trihedron.recorded_building import building_of
 from trihedron.trajectory import Trajectory
 from trihedron.words import words_of
@@ -46,8 +47,7 @@ class Recording:
     """
 
     def __init__(self, path: str | Path) -> None:
-        file = Path(path).expanduser()
-        self.path = file / "run.mcap" if file.is_dir() else file
+        self.path = recording_file(Path(path).expanduser())
         self._file: reader.Recording = open_recording(self.path)
         self._temporary: tempfile.TemporaryDirectory[str] | None = None  # of a replay: it lives as long as this object
 

@@ -1,5 +1,8 @@
 """`trihedron topics`: what a file holds, and one clear line for one that is damaged."""
 
+import shutil
+from pathlib import Path
+
 import numpy as np
 import pytest
 from mcap.writer import Writer
@@ -111,3 +114,17 @@ def test_a_file_that_is_still_being_written(tmp_path, capsys):
     ]
     writer.close()
     assert th.Recording(path).frames == (0, 1, 2) and capsys.readouterr().err == ""
+
+
+def test_the_folder_of_a_run_stands_for_its_recording(tmp_path, capsys):
+    (tmp_path / "run").mkdir()
+    shutil.copy(Path(__file__).parents[1] / "fuzz" / "seeds" / "own.mcap", tmp_path / "run" / "run.mcap")
+    printed = []
+    for words in (["topics", "run"], ["topics", "run/run.mcap"], ["diff", "run", "run/run.mcap"]):
+        assert main([words[0], *(str(tmp_path / word) for word in words[1:])]) == 0
+        printed.append(capsys.readouterr().out)
+    assert printed[0] == printed[1] and printed[2].startswith("equal: ")
+    (tmp_path / "empty").mkdir()
+    assert main(["topics", str(tmp_path / "empty")]) == 1
+    cause = "cannot be read: No such file or directory; give the path of an MCAP file"
+    assert capsys.readouterr().err == f"trihedron: {tmp_path}/empty/run.mcap: {cause}\n"

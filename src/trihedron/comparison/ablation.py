@@ -25,6 +25,7 @@ from trihedron.pipeline.core.config import Feedback
 from trihedron.pipeline.core.errors import ConfigError, DataError, TrihedronError, UsageError, did_you_mean
 from trihedron.pipeline.core.files import write_file
 from trihedron.pipeline.core.slots import FOLDS
+from trihedron.pipeline.record.mcap_file import recording_file
 from trihedron.pipeline.record.reader import Recording, TopicReader
 from trihedron.pipeline.record.trajectories import attached_truth
 from trihedron.pipeline.run.replay import RECORDED
@@ -81,7 +82,7 @@ def options_of(words: Sequence[str], budget: bool = False) -> Options:
         raise UsageError("--budget", f"is of one run, and {len(recordings)} recordings are given", "give one of them")
     if not swaps:
         raise UsageError("ablate", "nothing is swapped", "give STAGE=PLUGIN,PLUGIN or STAGE.OPTION=VALUE,VALUE")
-    paths = tuple(path / "run.mcap" if path.is_dir() else path for path in (Path(word).expanduser() for word in recordings))
+    paths = tuple(recording_file(Path(word).expanduser()) for word in recordings)
     if (missing := next((path for path in paths if not path.exists()), None)) is not None:
         raise DataError(str(missing), "there is no such recording", "give RUN.mcap or a run folder")
     if not settings.get("out"):
