@@ -20,13 +20,13 @@ from typing import TYPE_CHECKING, Any
 
 from trihedron.pipeline.core.errors import DataError, RecordingError, UsageError
 from trihedron.pipeline.core.text_table import table
+from trihedron.pipeline.record.mcap_file import RECORDING
 from trihedron.tools.arguments import Parser
 
 if TYPE_CHECKING:
     from trihedron.pipeline.core.types import Trajectory
     from trihedron.pipeline.run.metrics import I64
 
-RECORDING = "run.mcap"
 LARGEST_DIFFERENCE_MS = 1000.0
 MIRRORED = 0.5  # of the rotation error: a truth that fits that much better mirrored has another handedness
 ROUNDING_NS = 100_000  # stamps of other programs have 4 to 6 decimals

@@ -16,11 +16,11 @@ from trihedron.comparison.ablation_tables import FIGURES
 from trihedron.comparison.fold_measures import COLUMNS, Measures, of_building, of_surface
 from trihedron.comparison.partings import FALSE_AXES, OPEN_LOOP
 from trihedron.comparison.stage_measures import MEASURES
-from trihedron.comparison.surface_errors import RECORDING
 from trihedron.pipeline.core.config import Feedback
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.slots import FOLDS, SLOTS, output_of, strip_none
 from trihedron.pipeline.core.types import ManhattanFrame, Pose
+from trihedron.pipeline.record.mcap_file import RECORDING
 
 FOLDER = "open_loop"
 MEASURED = [slot for slot in SLOTS if slot not in FOLDS and strip_none(output_of(slot)) in {*MEASURES, ManhattanFrame} - {Pose}]

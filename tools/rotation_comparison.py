@@ -14,8 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
-from trihedron.comparison.axes import FALSE_DEG, RECORDING, RIGHT_DEG, common_world, draw, read_runs
+from trihedron.comparison.axes import FALSE_DEG, RIGHT_DEG, common_world, draw, read_runs
 from trihedron.pipeline.core.text_table import table
+from trihedron.pipeline.record.mcap_file import RECORDING
 from trihedron.tools.arguments import Parser
 
 

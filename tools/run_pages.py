@@ -20,6 +20,7 @@ from trihedron.pipeline.core.files import MAX_YAML_BYTES, YamlError, file_sha256
 from trihedron.pipeline.core.geometry import transform, umeyama, upright
 from trihedron.pipeline.core.registry import drawing_of
 from trihedron.pipeline.core.types import F64, Building, Pose, Surface, Trajectory, Value
+from trihedron.pipeline.record.mcap_file import RECORDING
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import attached_truth, read_trajectory
 from trihedron.pipeline.run.metrics import FEWEST_POSES, aligned_errors, associate
@@ -47,7 +48,7 @@ V = TypeVar("V", bound=Value)
 TRUTH_LOOK = ("ground truth", TRUTH, DASHES[1])
 MOST_TRIANGLES = 10_000  # of a surface; there is a page for each run
 MOST_PICTURES = 12  # a page of a large sweep would be too big to open
-RECORDING, TRAJECTORY, SURFACE = "run.mcap", "trajectory.txt", "surface.ply"
+TRAJECTORY, SURFACE = "trajectory.txt", "surface.ply"
 CONFIGURATION = Path(".hydra") / "config.yaml"
 NOT_REPEATED = ("out", "hydra.sweep.dir")  # of the words of a command
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from trihedron.datasets.readers.picture_headers import JPEG, PNG, UnreadableImage, picture_header, png_pixels
 from trihedron.pipeline.core.errors import DataError, printable
 from trihedron.pipeline.core.files import SHOWN, read_file
-from trihedron.pipeline.core.png_codec import decode_png
+from trihedron.pipeline.core.png_codec import decode_png, in_rgb
 from trihedron.pipeline.core.types import F32, U8
 
 RGB = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
@@ -106,7 +106,7 @@ def _decode_opencv(data: bytes, channels: int) -> NDArray[Any] | None:
         return None
     if image.ndim == 2 or is_rgb:
         return np.asarray(image)
-    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB if image.shape[2] == 3 else cv2.COLOR_BGRA2RGBA))
+    return in_rgb(image)
 
 
 def check_size(path: Path, image: NDArray[Any], width: int, height: int, reference: str, cure: str) -> None:

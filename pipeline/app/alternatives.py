@@ -20,7 +20,6 @@ from omegaconf import DictConfig, OmegaConf
 from trihedron.pipeline.app.budgets import budget_of
 from trihedron.pipeline.app.compilation import compile_once
 from trihedron.pipeline.app.execute import (
-    RECORDING,
     Warnings,
     close_writer,
     metadata_of,
@@ -36,6 +35,7 @@ from trihedron.pipeline.core.errors import TrihedronError
 from trihedron.pipeline.core.graph import Graph
 from trihedron.pipeline.core.overrides import literal_text
 from trihedron.pipeline.core.types import F64
+from trihedron.pipeline.record.mcap_file import RECORDING
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import attached_truth
 from trihedron.pipeline.record.writer import RecordingWriter

@@ -32,6 +32,7 @@ from trihedron.pipeline.core.registry import write_files_of
 from trihedron.pipeline.core.slots import SLOTS, output_of
 from trihedron.pipeline.core.types import Trajectory
 from trihedron.pipeline.record.foxglove_server import FoxgloveServer
+from trihedron.pipeline.record.mcap_file import RECORDING
 from trihedron.pipeline.record.mcap_writer import FLUSH_SECONDS
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import TRUTH, attached_truth, format_trajectory
@@ -48,7 +49,6 @@ from trihedron.pipeline.run.stated_sigma import sigma_line
 from trihedron.pipeline.run.timing import forget_peak
 from trihedron.pipeline.run.warm_up import compilation_reported, warm_up_budgeted
 
-RECORDING = "run.mcap"
 NETWORKS = tuple(f"{slot}.model" for slot in SLOTS)  # files of networks, of the plugins that run one
 READ_PATHS = ("dataset.path", "dataset.camera", "dataset.options.path", "dataset.options.camera", "load_map", "building.edits", *NETWORKS)
 PLAIN_PROGRESS_SECONDS = 5.0

@@ -36,6 +36,11 @@ def _by_opencv(data: bytes, channels: int) -> NDArray[Any]:
         raise ValueError("OpenCV cannot decode it")
     if image.ndim == 2 or channels == 1:
         return np.asarray(image if image.ndim == 2 else image[..., 0])
+    return in_rgb(image)
+
+
+def in_rgb(image: NDArray[Any]) -> NDArray[Any]:
+    """Turn the channels of a BGR or BGRA image of OpenCV round."""
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB if image.shape[2] == 3 else cv2.COLOR_BGRA2RGBA))
 
 

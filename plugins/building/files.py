@@ -38,10 +38,11 @@ def write_building(out: Path, building: Building, name: str = "") -> list[str]:
     write_json(out / JSON, building)
     write_svg(out / SVG, building, name)
     write_glb(out / GLB, building)
+    without = [f"no {DXF}: {library_error('ezdxf')}"]
     if has_dxf():
         write_dxf(out / DXF, building)
-    missing = [] if has_dxf() else [f"no {DXF}: {library_error('ezdxf')}"]
-    return [summary(building), *missing, *missing_edits(building)]
+        without = []
+    return [summary(building), *without, *missing_edits(building)]
 
 
 def summary(building: Building) -> str:

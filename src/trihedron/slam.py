@@ -26,7 +26,7 @@ from trihedron.datasets.simulation.synthetic import Synthetic
 from trihedron.images import Frames, stamp_of
 from trihedron.pipeline.app.budgets import budget_of
 from trihedron.pipeline.app.compilation import compile_once
-from trihedron.pipeline.app.execute import RECORDING, metadata_of, recorded_topics, remembered_of, source_of, write_files, write_models
+from trihedron.pipeline.app.execute import metadata_of, recorded_topics, remembered_of, source_of, write_files, write_models
 from trihedron.pipeline.app.viewers import Viewer, opened_viewer
 from trihedron.pipeline.core import types
 from trihedron.pipeline.core.config import RerunView, check_added, compose_run, graph_of
@@ -34,6 +34,7 @@ from trihedron.pipeline.core.errors import ConfigError, UsageError, did_you_mean
 from trihedron.pipeline.core.graph import Graph
 from trihedron.pipeline.core.types import FrameReference, Map, Surface, Value
 from trihedron.pipeline.record.codec import FRAMES_TOPIC
+from trihedron.pipeline.record.mcap_file import RECORDING
 from trihedron.pipeline.record.mcap_writer import new_recording
 from trihedron.pipeline.record.rescue import recover
 from trihedron.pipeline.record.writer import RecordingWriter

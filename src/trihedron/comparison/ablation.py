@@ -20,12 +20,12 @@ from trihedron.comparison.frame_errors import Errors, errors_file, of_result, re
 from trihedron.comparison.partings import Parting, StageErrors, changed_by_code, reference_of
 from trihedron.comparison.swaps import Combination, combinations_of, folder_name, parse_swaps, single_swaps, without_repeats
 from trihedron.pipeline.app.alternatives import Alternatives, Outcome, alternatives_of
-from trihedron.pipeline.app.execute import MAX_THREADS, RECORDING
+from trihedron.pipeline.app.execute import MAX_THREADS
 from trihedron.pipeline.core.config import Feedback
 from trihedron.pipeline.core.errors import ConfigError, DataError, TrihedronError, UsageError, did_you_mean
 from trihedron.pipeline.core.files import write_file
 from trihedron.pipeline.core.slots import FOLDS
-from trihedron.pipeline.record.mcap_file import recording_file
+from trihedron.pipeline.record.mcap_file import RECORDING, recording_file
 from trihedron.pipeline.record.reader import Recording, TopicReader
 from trihedron.pipeline.record.trajectories import attached_truth
 from trihedron.pipeline.run.replay import RECORDED

@@ -16,12 +16,13 @@ from trihedron.pipeline.core.files import one_line_errors, parse_yaml
 from trihedron.pipeline.core.geometry import nearest_pairs, nearest_rotation
 from trihedron.pipeline.core.lie import log_so3
 from trihedron.pipeline.core.types import F64, ManhattanFrame
+from trihedron.pipeline.record.mcap_file import RECORDING
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import attached_truth
 from trihedron.pipeline.run.result_files import read_results
 from trihedron.plugins.shared.manhattan_frames_kernels import CUBE, nearest_equivalent
 
-RECORDING, TIMING, ERRORS_PNG = "run.mcap", "timing.json", "rotation_error.png"
+TIMING, ERRORS_PNG = "timing.json", "rotation_error.png"
 LARGEST_DIFFERENCE_NS = 20_000_000
 CANDIDATES, INLIER_DEG = 20, 5.0  # claims of a run tried as the truth; residual of those that are averaged
 RIGHT_DEG, FALSE_DEG = 1.0, 3.0

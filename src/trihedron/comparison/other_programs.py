@@ -13,11 +13,11 @@ import numpy as np
 
 from trihedron.pipeline.core.errors import DataError, RecordingError, UsageError
 from trihedron.pipeline.core.types import FrameReference, Trajectory
+from trihedron.pipeline.record.mcap_file import RECORDING
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import MAX_DISTANCE_M, attached_truth, parse_trajectory, table_lines
 from trihedron.pipeline.run.metrics import I64, associate, evaluate_trajectory
 
-RECORDING = "run.mcap"
 KITTI_COLUMNS = 12
 ROUNDING_NS = 100_000  # stamps of other programs have 4 to 6 decimals
 MOST_FOREIGN = 0.2  # of the poses may belong to frames that a run does not have; beyond that it is another sequence

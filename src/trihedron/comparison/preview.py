@@ -7,8 +7,8 @@ from pathlib import Path
 
 from trihedron.comparison.swaps import Combination
 from trihedron.pipeline.app.alternatives import Alternatives
-from trihedron.pipeline.app.execute import RECORDING
 from trihedron.pipeline.core.errors import printable
+from trihedron.pipeline.record.mcap_file import RECORDING
 from trihedron.pipeline.run.replay import RECORDED
 from trihedron.pipeline.run.side_by_side import SideBySide, users_of
 from trihedron.pipeline.sweep.jobs import DONE
