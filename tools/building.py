@@ -71,15 +71,7 @@ def main(argv: list[str]) -> int:
 
 def _has_more_edits(path: Path, building: Building) -> bool:
     """Say if a file has corrections by hand that the building lacks. Raises DataError for a file with a mistake."""
-    from trihedron.plugins.building.edits import WITHOUT_IDS, edits_in, read_edits
-    from trihedron.plugins.building.files import building_json
+    from trihedron.plugins.building.edits import edits_in
+    from trihedron.plugins.building.files import building_json, kept_edits
 
-    if not path.exists():
-        return False
-    try:
-        edits = read_edits(str(path))
-    except DataError as error:
-        if error.cause == WITHOUT_IDS:  # an older version wrote it
-            return False
-        raise
-    return bool(set(edits) - set(edits_in(str(path), building_json(building))))
+    return path.exists() and bool(set(kept_edits(path)) - set(edits_in(str(path), building_json(building))))

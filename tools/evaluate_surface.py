@@ -17,10 +17,11 @@ import json
 from pathlib import Path
 from typing import Any
 
-from trihedron.comparison.surface_errors import FIGURES, SURFACE, WITHIN_M, evaluate_files
+from trihedron.comparison.surface_errors import WITHIN_M, evaluate_files
 from trihedron.pipeline.core.files import write_file
 from trihedron.pipeline.core.text_table import table
 from trihedron.pipeline.record.mcap_file import recording_file
+from trihedron.plugins.surface.files import SURFACE, SURFACE_ERRORS
 from trihedron.tools.arguments import Parser
 
 
@@ -35,7 +36,7 @@ def main(argv: list[str]) -> int:
     truth: Path = arguments.truth or mesh.parent
     figures = evaluate_files(mesh, recording_file(truth))
     if arguments.mesh.is_dir() and arguments.truth is None:
-        write_file(arguments.mesh / FIGURES, json.dumps(figures, indent=2) + "\n")
+        write_file(arguments.mesh / SURFACE_ERRORS, json.dumps(figures, indent=2) + "\n")
     print(json.dumps(figures, indent=2) if arguments.json else report(figures))
     return 0
 

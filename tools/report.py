@@ -20,11 +20,12 @@ from trihedron.pipeline.core.errors import DataError, TrihedronError
 from trihedron.pipeline.core.files import write_file
 from trihedron.pipeline.record.mcap_file import RECORDING
 from trihedron.pipeline.run.result_files import read_results
+from trihedron.pipeline.run.results import TRAJECTORY
 from trihedron.pipeline.run.stated_sigma import CAUSES, dominant_cause
 from trihedron.tools.arguments import Parser
 from trihedron.tools.pages import render
 from trihedron.tools.run_configurations import changed_options
-from trihedron.tools.run_pages import MOST_PICTURES, TRAJECTORY, RunFacts, drawings_of, facts_of, frame_picture
+from trihedron.tools.run_pages import MOST_PICTURES, RunFacts, drawings_of, facts_of, frame_picture
 
 TITLE_NAMES = 6
 MOST_TRIANGLES = 40_000  # of the page's one surface

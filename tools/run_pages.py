@@ -25,8 +25,10 @@ from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import attached_truth, read_trajectory
 from trihedron.pipeline.run.metrics import FEWEST_POSES, aligned_errors, associate
 from trihedron.pipeline.run.result_files import read_results
+from trihedron.pipeline.run.results import TRAJECTORY
 from trihedron.plugins.building.files import summary
 from trihedron.plugins.building.svg import floorplan_svg
+from trihedron.plugins.surface.files import SURFACE
 from trihedron.tools.page_figures import (
     DASHES,
     TRUTH,
@@ -48,7 +50,6 @@ V = TypeVar("V", bound=Value)
 TRUTH_LOOK = ("ground truth", TRUTH, DASHES[1])
 MOST_TRIANGLES = 10_000  # of a surface; there is a page for each run
 MOST_PICTURES = 12  # a page of a large sweep would be too big to open
-TRAJECTORY, SURFACE = "trajectory.txt", "surface.ply"
 CONFIGURATION = Path(".hydra") / "config.yaml"
 NOT_REPEATED = ("out", "hydra.sweep.dir")  # of the words of a command
 

@@ -42,7 +42,7 @@ from trihedron.pipeline.record.writer import RecordingWriter
 from trihedron.pipeline.run.memory import malloc_trim
 from trihedron.pipeline.run.recorder import Recorder
 from trihedron.pipeline.run.replay import TOPICS, Replay
-from trihedron.pipeline.run.run_folder import lock_folder, write_configuration
+from trihedron.pipeline.run.run_folder import claim_folder, write_configuration
 from trihedron.pipeline.run.runner import Runner
 from trihedron.pipeline.run.side_by_side import SideBySide, changed_stages, swapped_stages, with_one_dataset
 from trihedron.pipeline.run.timing import begin_together
@@ -130,8 +130,8 @@ class Alternatives:
     def _compute(self, folders: Sequence[Path], on_frame: Frames) -> None:
         began, truth = time.perf_counter(), attached_truth(self.recording.attachments, str(self.recording.path))
         with ExitStack() as stack:
-            for folder in folders:
-                stack.enter_context(lock_folder(folder))
+            for alternative, runner, folder in zip(self.alternatives, self.runners, folders):
+                stack.enter_context(claim_folder(folder, alternative.config, runner.computed))
             writers = [self._open_recording(alternative, folder) for alternative, folder in zip(self.alternatives, folders)]
             cpu_began = time.process_time()
             together = SideBySide(self.runners, self.threads)

@@ -42,7 +42,7 @@ from trihedron.pipeline.run.interrupts import defer_interrupts
 from trihedron.pipeline.run.live import Pace, shows_once
 from trihedron.pipeline.run.map_file import load_map, save_map
 from trihedron.pipeline.run.replay import TOPICS, Replay
-from trihedron.pipeline.run.run_folder import FolderBefore, lock_folder, point_latest, write_configuration
+from trihedron.pipeline.run.run_folder import FolderBefore, claim_folder, point_latest, remove_models, write_configuration
 from trihedron.pipeline.run.runner import Runner, Step
 from trihedron.pipeline.run.state import DelayLines, max_delays
 from trihedron.pipeline.run.stated_sigma import sigma_line
@@ -51,6 +51,8 @@ from trihedron.pipeline.run.warm_up import compilation_reported, warm_up_budgete
 
 NETWORKS = tuple(f"{slot}.model" for slot in SLOTS)  # files of networks, of the plugins that run one
 READ_PATHS = ("dataset.path", "dataset.camera", "dataset.options.path", "dataset.options.camera", "load_map", "building.edits", *NETWORKS)
+RESULTS = (results.TRAJECTORY, results.CAUSAL, results.METRICS, PLOT)  # of the poses, where there are some
+OWN_FILES = (*RESULTS, results.TIMING, RECORDING)
 PLAIN_PROGRESS_SECONDS = 5.0
 MAX_THREADS = 256
 
@@ -85,7 +87,7 @@ def _execute(config: DictConfig, out: Path, overrides: list[str], began: float, 
     _announce(runner)
     trial = partial(Runner, graph, config.seed, config.threads, replay, frames, remembered)
     before = FolderBefore.of(out / RECORDING)
-    with lock_folder(out), _removed_without_frames(runner, before):
+    with claim_folder(out, config, runner.computed), _removed_without_frames(runner, before):
         compile_once(runner.computed, runner.count if runner.feed is None else None)
         write_configuration(out, config, overrides)
         with Warnings() as warnings, compilation_reported():
@@ -288,6 +290,8 @@ def write_files(
     if runner.budgeted is not None:
         timing["budget"] = runner.budgeted.summary()
     try:
+        for name in RESULTS if runner.result.stamps_ns else ():  # of an earlier run
+            (out / name).unlink(missing_ok=True)
         if "pose" in runner.computed:
             result = results.with_unpacked_poses(runner.result)
             final = results.final_trajectory(result)
@@ -312,8 +316,11 @@ def _attachments(graph: Graph, replay: Replay | None) -> dict[str, str]:
 
 
 def write_models(out: Path, runner: Runner) -> list[str]:
-    """Write the files of a run's folds (surface, building), and return lines that describe them."""
-    return [line for slot, value in runner.result.folds.items() for line in write_files_of(slot, out, value)]
+    """Write the files of a run's folds (surface, building) in the place of an earlier run's, and return lines that describe them."""
+    removed = remove_models(out, OWN_FILES)
+    lines = [line for slot, value in runner.result.folds.items() for line in write_files_of(slot, out, value)]
+    stale = ", ".join(sorted(name for name in removed if not (out / name).exists()))
+    return [*lines, *([f"removed, as it was of an earlier run: {stale}"] if stale else [])]
 
 
 def _replay_summary(replay: Replay, runner: Runner, timing: dict[str, Any]) -> str:

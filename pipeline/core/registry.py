@@ -12,7 +12,8 @@ import inspect
 import pkgutil
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
 from enum import Enum
 from importlib.metadata import entry_points
 from importlib.util import find_spec
@@ -38,11 +39,25 @@ ENTRY_POINT_GROUP = "trihedron.plugins"
 _BROKEN: dict[str, str] = {}  # packages and modules of plugins that do not load, and why
 _LOADING = threading.RLock()
 FileWriter = Callable[[Path, Any], list[str]]
-_FILES: dict[str, FileWriter] = {}
+FileCheck = Callable[[Path, Mapping[str, Any] | None], None]
 CovariancePart = Callable[[Pose], F64]
 DrawingOf = Callable[[Any], Drawing]
 _COVARIANCES: dict[str, CovariancePart] = {}
 _DRAWINGS: dict[type[Value], DrawingOf] = {}
+
+
+@dataclass(frozen=True)
+class FoldFiles:
+    """What a fold's value leaves in a run folder: `write` writes it and returns lines that describe it; `names` are those of all files that may come
+    of it, later commands included; `check` raises TrihedronError where a run with these options of the stage, None without it, would lose what a user
+    wrote there."""
+
+    write: FileWriter
+    names: frozenset[str]
+    check: FileCheck | None = None
+
+
+_FILES: dict[str, FoldFiles] = {}
 
 
 def register(slot: str, name: str) -> Callable[[Plugin], Plugin]:
@@ -206,16 +221,27 @@ def _register_in(known: dict[Key, Function], key: Key) -> Callable[[Function], F
     return decorate
 
 
-def register_files(slot: str) -> Callable[[FileWriter], FileWriter]:
-    """Register the function that writes the files of a fold's value into a run folder, and returns lines that describe them (decorator)."""
-    return _register_in(_FILES, slot)
+def register_files(slot: str, names: Collection[str], check: FileCheck | None = None) -> Callable[[FileWriter], FileWriter]:
+    """Register the function that writes the files of a fold's value into a run folder, as `FoldFiles.write` (decorator)."""
+
+    def decorate(write: FileWriter) -> FileWriter:
+        _FILES[slot] = FoldFiles(write, frozenset(names), check)
+        return write
+
+    return decorate
 
 
 def write_files_of(slot: str, folder: Path, value: Any) -> list[str]:
     """Write the files of a fold's value into a folder; returns lines that describe them, none where the slot has no files."""
     if slot not in _FILES:
         load_plugins()
-    return _FILES[slot](folder, value) if slot in _FILES else []
+    return _FILES[slot].write(folder, value) if slot in _FILES else []
+
+
+def files_of_folds() -> dict[str, FoldFiles]:
+    """Return what each slot leaves in a run folder, for those that leave files there."""
+    load_plugins()
+    return dict(_FILES)
 
 
 def register_drawing(kind: type[Value]) -> Callable[[DrawingOf], DrawingOf]:

@@ -1,10 +1,12 @@
-"""The folder of a run: made, held for this process before anything is written into it, and emptied again where no frame came."""
+"""The folder of a run: made, held for this process before anything is written into it, and emptied again where no frame came.
+
+A run replaces what an earlier one left in its folder. It is refused where that is what it reads, or what a user wrote by hand."""
 
 from __future__ import annotations
 
 import fcntl
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +17,8 @@ from omegaconf import DictConfig, OmegaConf
 
 from trihedron.pipeline.core.errors import ConfigError, DataError
 from trihedron.pipeline.core.files import make_folder, write_file
+from trihedron.pipeline.core.registry import files_of_folds
+from trihedron.pipeline.record.mcap_file import RECORDING, recording_file
 
 CONFIG = ".hydra"  # folder of the composed configuration and the words it was composed of
 CURE = "give another out=FOLDER"
@@ -57,6 +61,39 @@ def _identity(path: Path) -> tuple[int, int] | None:
     with suppress(OSError):
         return (found := path.stat()).st_ino, found.st_ctime_ns
     return None
+
+
+@contextmanager
+def claim_folder(folder: Path, config: DictConfig, computed: Collection[str]) -> Iterator[None]:
+    """Make the folder of a run of this configuration, which computes these stages, and lock it for the block, as `lock_folder` does. Raises
+    TrihedronError, before anything is written, where results would be replaced that the run reads, or that a user corrected by hand."""
+    _check_sources(folder / RECORDING, config)
+    if folder.is_dir() and any(folder.iterdir()):
+        for slot, files in files_of_folds().items():
+            if files.check is not None:
+                files.check(folder, config.get(slot) if slot in computed else None)
+    with lock_folder(folder):
+        yield
+
+
+def _check_sources(recording: Path, config: DictConfig) -> None:
+    """Raise ConfigError where the run reads the recording in whose place it would write."""
+    for key in ("replay", "dataset.path", "dataset.options.path"):
+        if isinstance(given := OmegaConf.select(config, key), str) and given and recording.exists():
+            path = Path(given).expanduser()
+            source = path if key != "replay" and OmegaConf.select(config, "dataset.plugin") != "mcap" else recording_file(path)
+            if source.exists() and source.samefile(recording):
+                raise ConfigError("out", f"{recording} would be replaced, which {key} reads", CURE)
+
+
+def remove_models(folder: Path, kept: Collection[str]) -> set[str]:
+    """Remove the files of models that an earlier run, or a command on it, left in a folder, and return their names: beside the recording of another
+    run they would be taken for its own. `kept` are the names of the run's other files."""
+    others = {path.name for path in folder.iterdir() if path.is_file()} - set(kept)
+    models = {name for files in files_of_folds().values() for name in files.names} & others if others else set()  # which imports all plugins
+    for name in models:
+        (folder / name).unlink()
+    return models
 
 
 @contextmanager

@@ -4,12 +4,14 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from trihedron.pipeline.core.descriptions import summary_of_building
+from trihedron.pipeline.core.errors import ConfigError, DataError
 from trihedron.pipeline.core.files import write_file
 from trihedron.pipeline.core.libraries import library_error
 from trihedron.pipeline.core.linalg import norm
@@ -17,16 +19,37 @@ from trihedron.pipeline.core.plan_areas import area_interval, area_sigma, edge_s
 from trihedron.pipeline.core.registry import register_files
 from trihedron.pipeline.core.types import ELEMENTS, F64, OPENING_KINDS, SUPPORTS, Building
 from trihedron.plugins.building.dxf import DXF, has_dxf, write_dxf
-from trihedron.plugins.building.edits import missing_edits
+from trihedron.plugins.building.edits import WITHOUT_IDS, missing_edits, read_edits
 from trihedron.plugins.building.geometry import CEILING, MODEL_COLORS, parts_of
-from trihedron.plugins.building.labels import LISTS, id_of, name_of, parse_edits, plain_edits, use_of
+from trihedron.plugins.building.ifc import IFC
+from trihedron.plugins.building.labels import LISTS, Edit, id_of, name_of, parse_edits, plain_edits, use_of
+from trihedron.plugins.building.pdf import PDF
 from trihedron.plugins.building.svg import SVG, write_svg
 
 JSON, GLB = "building.json", "building.glb"
 SCHEMA_VERSION = 1
 
 
-@register_files("building")
+def check_edits(folder: Path, options: Mapping[str, Any] | None) -> None:
+    """Raise ConfigError where a run with these options of the stage, None without it, would lose corrections by hand, and DataError where they have a
+    mistake."""
+    file, given = folder / JSON, "" if options is None else options.get("edits", "")
+    if file.exists() and set(kept_edits(file)) - set(read_edits(given)):
+        cure = "give another out=FOLDER" + (f", or building.edits={file}" if options is not None else "")
+        raise ConfigError("out", f"{file} holds corrections by hand, which would be lost", cure)
+
+
+def kept_edits(file: Path) -> tuple[Edit, ...]:
+    """Return the corrections in a building.json that is to be replaced; none in one of an older version. Raises DataError for one with a mistake."""
+    try:
+        return read_edits(str(file))
+    except DataError as error:
+        if error.cause == WITHOUT_IDS:
+            return ()
+        raise
+
+
+@register_files("building", (JSON, SVG, PDF, DXF, GLB, IFC), check_edits)
 def write_run_files(out: Path, building: Building) -> list[str]:
     """Write the files of a run folder, whose name the plan has; returns lines as `write_building` does."""
     return write_building(out, building, out.resolve().name)

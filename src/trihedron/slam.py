@@ -42,7 +42,7 @@ from trihedron.pipeline.run import results
 from trihedron.pipeline.run.budget import EFFORT_TOPIC, Budget
 from trihedron.pipeline.run.map_file import save_map
 from trihedron.pipeline.run.replay import TOPICS
-from trihedron.pipeline.run.run_folder import lock_folder, write_configuration
+from trihedron.pipeline.run.run_folder import claim_folder, write_configuration
 from trihedron.pipeline.run.runner import Runner, Step
 from trihedron.pipeline.run.sinks import MemorySink, Sink
 from trihedron.pipeline.run.warm_up import WARM_UP_FRAMES, compilation_reported, warm_up_budgeted
@@ -150,8 +150,8 @@ class Slam:
     def _open(self, graph: Graph, viewer: Viewer, budget: Budget | None) -> None:
         """Open the run folder and its recording, then compile and load what the first frames need."""
         if self._out is not None:
-            self._stack.enter_context(lock_folder(self._out))
             self._config.out = str(self._out)
+            self._stack.enter_context(claim_folder(self._out, self._config, self._runner.computed))
             write_configuration(self._out, self._config, self._words)
         compile_once(self._runner.computed, None)
         with compilation_reported():

@@ -10,10 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from trihedron.comparison.surface_errors import FIGURES, SURFACE, evaluate_files
+from trihedron.comparison.surface_errors import evaluate_files
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.files import file_sha256, write_file
 from trihedron.pipeline.run.result_files import read_results
+from trihedron.plugins.surface.files import SURFACE, SURFACE_ERRORS
 
 BUILDING = {  # column -> key of the figures, the value where it is perfect, factor
     "walls mm": ("wall_m", 0.0, 1e3),
@@ -50,13 +51,13 @@ def judge_surface(run: Path, recording: Path) -> dict[str, Any]:
 
 def _write_figures(run: Path, figures: dict[str, Any]) -> dict[str, Any]:
     """Write the figures of a run's surface to surface.json, and return them."""
-    write_file(run / FIGURES, json.dumps(figures, indent=2) + "\n")
+    write_file(run / SURFACE_ERRORS, json.dumps(figures, indent=2) + "\n")
     return figures
 
 
 def of_surface(run: Path) -> Measures:
     """Return the measures of a run folder's surface; empty where it was not judged."""
-    return of_surface_figures(figures) if (figures := read_results(run / FIGURES)) else {}
+    return of_surface_figures(figures) if (figures := read_results(run / SURFACE_ERRORS)) else {}
 
 
 def of_surface_figures(figures: Mapping[str, Any]) -> Measures:

@@ -18,11 +18,11 @@ from trihedron.pipeline.core.errors import DataError, UsageError, did_you_mean, 
 from trihedron.pipeline.run.result_files import read_results, read_words
 from trihedron.pipeline.sweep.jobs import SEEDS
 from trihedron.pipeline.sweep.paired_statistics import half_interval
+from trihedron.plugins.surface.files import SURFACE, SURFACE_ERRORS
 
 ALL_DATA = "all"  # in the place of a data set: differences over all of them
 NOT_SHOWN = ("out", "report", "experiment", "sequences", "alternatives", *SEEDS)
 OVERRIDES = Path(".hydra") / "overrides.yaml"
-SURFACE, SURFACE_FIGURES = "surface.ply", "surface.json"
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ def _run(folder: Path) -> Run:
     metrics, timing, job = (read_results(folder / name) for name in ("metrics.json", "timing.json", "job.json"))
     if job.get("state", "done") != "done":
         return Run(folder, overrides, dict.fromkeys(FIGURES, np.nan), str(job.get("error") or "was stopped before its end"))
-    figures = _figures_in_units(metrics, timing, read_results(folder / SURFACE_FIGURES))
+    figures = _figures_in_units(metrics, timing, read_results(folder / SURFACE_ERRORS))
     return Run(folder, overrides, figures, str(metrics.get("note", "")) if metrics or timing else "holds no results")
 
 
@@ -122,7 +122,7 @@ def judge_surfaces(folders: Sequence[Path]) -> None:
 
     reasons = set()
     for folder in (run for given in folders for run in run_folders(given)):
-        if (folder / SURFACE).exists() and not (folder / SURFACE_FIGURES).exists():
+        if (folder / SURFACE).exists() and not (folder / SURFACE_ERRORS).exists():
             try:
                 judge_surface(folder, folder / "run.mcap")
             except DataError as error:

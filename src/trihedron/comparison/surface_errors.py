@@ -12,8 +12,7 @@ if TYPE_CHECKING:
     from trihedron.comparison.surface_truth import Truth
     from trihedron.pipeline.core.types import F64, I32, Trajectory
 
-SURFACE, TRAJECTORY = "surface.ply", "trajectory.txt"
-FIGURES = "surface.json"  # what is found of a run by its own truth is kept beside it, for `trihedron compare`
+TRAJECTORY = "trajectory.txt"
 SAMPLE_M = 0.02  # between the points of the mesh that are judged
 WITHIN_M = (0.02, 0.05)
 PARTS = ("all", "planar", "curved")
