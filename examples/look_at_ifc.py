@@ -5,7 +5,7 @@ viewer/bin/pip install ifcopenshell pyvista
 viewer/bin/python examples/look_at_ifc.py model.ifc             # in a window, where the mouse rotates the model
 viewer/bin/python examples/look_at_ifc.py model.ifc model.png   # as a picture, without a display
 
-Each storey has a view of its own, on top of those below it and without its ceiling. Openings are cut out of walls; spaces are names on the floor.
+Each storey has a view of its own, on top of those below it and without its ceiling. Openings are cut out of walls; spaces are names.
 Nothing of Trihedron is used: the picture shows what another program reads. The libraries (LGPL-3.0, MIT) take a gigabyte.
 """
 
@@ -45,7 +45,7 @@ def draw(plotter: Any, storeys: list[Any], meshes: dict[int, Any]) -> None:
         if element.is_a("IfcSpace"):
             if last:
                 name, (x, y, _) = element.LongName or element.Name or "space", mesh.center
-                place = [(x, y, mesh.bounds.z_min)]
+                place = [(x, y, mesh.bounds.z_max)]  # at the top of its walls, which would hide one on the floor
                 plotter.add_point_labels(place, [name], font_size=18, show_points=False, shape_color="white", always_visible=True)
         elif not (last and element.is_a("IfcSlab") and element.PredefinedType == "ROOF"):
             color = next((color for kind, color in COLORS.items() if element.is_a(kind)), OTHER)

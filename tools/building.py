@@ -74,4 +74,4 @@ def _has_more_edits(path: Path, building: Building) -> bool:
     from trihedron.plugins.building.edits import edits_in
     from trihedron.plugins.building.files import building_json, kept_edits
 
-    return path.exists() and bool(set(kept_edits(path)) - set(edits_in(str(path), building_json(building))))
+    return bool(set(kept_edits(path)) - set(edits_in(str(path), building_json(building))))

@@ -1,8 +1,8 @@
 """Compare two recordings value by value: the first topic, frame and field in which they differ, and by how much; then every topic that differs.
 
-Only frames and topics that both have are compared; without --topics a message names topics that one of them lacks. Exit code 0 when all of it is
-equal, bit for bit, 1 when not. With --tolerance real numbers are equal that differ by no more: |a - b| <= T max(1, |a|, |b|); every field that
-differs is listed with its largest such difference. Libraries of linear algebra round differently on other processors.
+Only frames and topics that both have are compared; a line names the frames that one of them lacks, and without --topics the topics. Exit code 0 when
+all of it is equal, bit for bit, 1 when not. With --tolerance real numbers are equal that differ by no more: |a - b| <= T max(1, |a|, |b|); each field
+that differs is listed with its largest such difference. Libraries of linear algebra round differently on other processors.
 
 Example: trihedron diff runs/a/run.mcap runs/b/run.mcap --topics pose,map
 Example: trihedron diff runs/a/run.mcap runs/b/run.mcap --tolerance 1e-6
@@ -38,8 +38,7 @@ def main(argv: list[str]) -> int:
         raise UsageError("--tolerance", f"{arguments.tolerance:g} is not a tolerance", "give a number from 0")
     a, b = Recording(arguments.a), Recording(arguments.b)
     topics, frames = _topics(a, b, arguments.topics), common_frames(a, b)
-    if not arguments.topics:
-        _report_lacking(a, b)
+    _report_lacking(a, b, bool(arguments.topics))
     if arguments.tolerance is not None:
         return _within(a, b, topics, frames, arguments.tolerance)
     found = [found for topic in topics if (found := difference(a, b, topic, frames)) is not None]
@@ -54,10 +53,14 @@ def main(argv: list[str]) -> int:
     return 1
 
 
-def _report_lacking(a: Recording, b: Recording) -> None:
+def _report_lacking(a: Recording, b: Recording, chosen: bool) -> None:
+    """Print the topics, unless some were chosen, and the frames that one recording has and the other lacks."""
+    frames = {file: {value.index for value in file.references} for file in (a, b)}
     for file, other in ((a, b), (b, a)):
-        if lacking := sorted(other.topics - file.topics):
+        if not chosen and (lacking := sorted(other.topics - file.topics)):
             print(f"{file.path} has no {', '.join(lacking)}")
+        if missing := frames[other] - frames[file]:
+            print(f"{file.path} lacks {len(missing)} frames of the other ({min(missing)}..{max(missing)})")
 
 
 def _within(a: Recording, b: Recording, topics: list[str], frames: list[int], tolerance: float) -> int:

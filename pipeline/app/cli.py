@@ -40,6 +40,11 @@ _FAILURES: list[Exception] = []  # of this process's runs
 _BEGAN = time.perf_counter()
 COMMAND_GROUP = "trihedron.commands"
 RUN_FLAGS = ("-m", "--multirun")
+CURES = {  # of a file that cannot be written, by the number of the error
+    errno.ENOSPC: "make room, or give another place",
+    errno.ENOENT: "make its folder first, or give another place",
+    errno.EISDIR: "give the name of a file in it",
+}
 DRY_RUN = "--dry-run", "dry_run=true"  # a flag of sweeps, and the word that it stands for
 RUN_HELP = """Track a sequence: compose the configuration, run the graph, write the run folder.
 
@@ -113,7 +118,8 @@ def _of_the_machine(error: Exception) -> TrihedronError | None:
     if isinstance(error, OSError) and error.strerror:
         if error.filename is None and error.errno in (errno.ENOSPC, errno.EIO, errno.EBADF):
             _discard_stdout()
-        return DataError(str(error.filename or "standard output"), f"cannot be used: {error.strerror}", "make room, or give another place")
+        cure = CURES.get(error.errno or 0, "give another place")
+        return DataError(str(error.filename or "standard output"), f"cannot be used: {error.strerror}", cure)
     if (exhausted := memory.exhaustion(error)) is not None:
         return exhausted
     if isinstance(error, RuntimeError) and "home directory" in str(error):  # Path.expanduser

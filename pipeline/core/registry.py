@@ -48,7 +48,7 @@ _DRAWINGS: dict[type[Value], DrawingOf] = {}
 
 @dataclass(frozen=True)
 class FoldFiles:
-    """What a fold's value leaves in a run folder: `write` writes it and returns lines that describe it; `names` are those of all files that may come
+    """Files of a fold's value in a run folder: `write` writes it and returns lines that describe it; `names` are those of all files that may come
     of it, later commands included; `check` raises TrihedronError where a run with these options of the stage, None without it, would lose what a user
     wrote there."""
 

@@ -34,15 +34,16 @@ def check_edits(folder: Path, options: Mapping[str, Any] | None) -> None:
     """Raise ConfigError where a run with these options of the stage, None without it, would lose corrections by hand, and DataError where they have a
     mistake."""
     file, given = folder / JSON, "" if options is None else options.get("edits", "")
-    if file.exists() and set(kept_edits(file)) - set(read_edits(given)):
+    if set(kept_edits(file)) - set(read_edits(given)):
         cure = "give another out=FOLDER" + (f", or building.edits={file}" if options is not None else "")
         raise ConfigError("out", f"{file} holds corrections by hand, which would be lost", cure)
 
 
 def kept_edits(file: Path) -> tuple[Edit, ...]:
-    """Return the corrections in a building.json that is to be replaced; none in one of an older version. Raises DataError for one with a mistake."""
+    """Return the corrections in a building.json that is to be replaced: none in one of an older version, nor in the target of a link, which stays.
+    Raises DataError for one with a mistake."""
     try:
-        return read_edits(str(file))
+        return read_edits(str(file)) if file.exists() and not file.is_symlink() else ()
     except DataError as error:
         if error.cause == WITHOUT_IDS:
             return ()

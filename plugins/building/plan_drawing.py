@@ -33,7 +33,7 @@ from trihedron.plugins.building.sheet import FONTS, Group, Letters, Mark, Shape,
 
 EDGE, GAP, ROW = 14.0, 40.0, 17.0  # points: round the sheet, between storeys, between rows of dimensions
 CLEAR = 1.5  # points between letters and what they must not cross
-TICK, ABOVE, BELOW = 3.0, -6.0, 7.5  # points: half a tick, the middle of a number from its line
+TICK, ABOVE, BEYOND = 3.0, -6.0, 7.5  # points: half a tick; the middle of a number from its line, where it fits and where it does not
 SHIFTS = (0.0, 1.0, -1.0, 2.0, -2.0)  # steps by which a number gives way to another
 SHORTEST_INNER_M = 0.8  # edge whose length is written inside
 ALONG = (0.5, 0.35, 0.65, 0.2, 0.8)  # shares of an edge where its length is written, the first that is free
@@ -251,7 +251,7 @@ def _dimension_row(axis: int, level: float, outward: float, ends: F64, per_m: fl
         length = abs(end - begin)
         text = f"{length / per_m:.2f}"
         fits = width_of(text, "length") + 2.0 * TICK <= length
-        side, step = ABOVE if fits or outward < 0.0 else BELOW, 0.15 * length if fits else 14.0
+        side, step = (ABOVE, 0.15 * length) if fits else (outward * BEYOND, 14.0)
         angle, middle = 0.0 if axis == 0 else -90.0, (begin + end) / 2.0
         ways = [Letters("length", text, _on(axis, middle + k * step, level + side), angle) for k in SHIFTS]
         found = next((way for way in ways if not any(way.box().intersects(other) for other in numbers)), ways[0])

@@ -371,6 +371,16 @@ def test_a_full_device_is_no_traceback(tmp_path):
     assert (done.returncode, done.stderr) == (1, line)
 
 
+def test_a_place_where_no_file_can_be_has_its_cure(tmp_path, capsys):
+    assert main(["run", *SMALL, "dataset.frames=0:2", "out=made"]) == 0
+    capsys.readouterr()
+    assert main(["report", "made", "--out", "nowhere/page.html"]) == 1
+    missing = "cannot be used: No such file or directory; make its folder first, or give another place"
+    assert capsys.readouterr().err == f"trihedron: nowhere/page.html: {missing}\n"
+    assert main(["compare", "made", "--json", "made"]) == 1
+    assert capsys.readouterr().err == "trihedron: made: cannot be used: Is a directory; give the name of a file in it\n"
+
+
 @pytest.mark.slow
 def test_an_ascii_terminal_is_no_traceback():
     for words in (["plugins"], ["run", "--help"], ["run", "dataset.width=-5"]):

@@ -8,6 +8,7 @@ from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 
+import cv2
 import html5lib
 import numpy as np
 import pytest
@@ -35,7 +36,7 @@ from trihedron.comparison.swaps import combinations_of, folder_name, parse_swaps
 from trihedron.pipeline.app.cli import main
 from trihedron.pipeline.core.errors import DataError, UsageError
 from trihedron.pipeline.core.slots import SLOTS
-from trihedron.pipeline.core.types import Translation
+from trihedron.pipeline.core.types import ManhattanFrame, Translation
 from trihedron.pipeline.record.reader import Recording
 from trihedron.tools.site import write_site
 from trihedron.tools.site_ablations import ablation_page, ablations_of, attribution_bars, charts_of
@@ -268,6 +269,16 @@ def test_where_two_variants_part():
     assert (parting.worst, parting.unit) == (3, "mm") and parting.distance == pytest.approx(5.0)
 
 
+def test_an_unsupported_frame_is_no_value():
+    seen, sigma = translation(0, 1.0), 1e-4 * np.eye(3)
+    found, kept = (ManhattanFrame.single(seen, np.eye(3), sigma, np.full(3, 9, np.int32), np.full(3, 0.01), supported) for supported in (True, False))
+    assert distance(found, found) == (0.0, "deg") and distance(found, kept) is None
+    errors = StageErrors({1000: np.eye(4)})
+    for value in (found, kept, None):
+        errors.take("manhattan", {"manhattan": value and replace(value, stamp_ns=1000)})
+    assert errors.figures(errors.of_frames())["values %"] == pytest.approx(100 / 3) and len(errors.axes) == 1
+
+
 def test_without_ground_truth_a_line_says_what_single_stages_are_measured_by():
     found = case(0, [1.0, 2.0, 3.0, 4.0])
     for variant in found.variants:
@@ -337,15 +348,22 @@ def test_a_folder_holds_the_ablations_of_one_recording(tmp_path, capsys, monkeyp
     before, _ = Path("found/ablation.json").read_bytes(), capsys.readouterr()
     for words in (["manhattan=plane_svd"], ["bundle=none", "--dry-run"]):
         assert main(["ablate", "second", *words, "out=found"]) == 1
-        cure = "give another out=DIR, or remove it"
-        assert capsys.readouterr().err.splitlines()[-1] == f"trihedron: found: holds the ablation of first/run.mcap; {cure}"
+        lines = capsys.readouterr().err.splitlines()
+        assert lines[-1] == "trihedron: found: holds the ablation of first/run.mcap; give another out=DIR"
     assert Path("found/ablation.json").read_bytes() == before
     assert main(["ablate", "first", "bundle=none", "out=found"]) == 0
-    assert "found: keeps what it holds of this recording besides: manhattan=plane_svd\n" in capsys.readouterr().err
+    assert "found: keeps what it holds of first/run.mcap besides: manhattan=plane_svd\n" in capsys.readouterr().err
     assert {tuple(one["swaps"]) for one in json.loads(Path("found/ablation.json").read_text()).values()} == {
         ("manhattan=plane_svd",),
         ("bundle=none",),
     }
+    assert main(["ablate", "second", "manhattan=plane_svd", "out=first"]) == 1
+    assert capsys.readouterr().err.splitlines()[-1] == "trihedron: first: is the folder of a run; give another out=DIR"
+    assert main(["ablate", "first", "second", "bundle=none", "out=both"]) == 0
+    assert main([*record, "out=third"]) == 0
+    assert main(["ablate", "third", "bundle=none", "out=both"]) == 0
+    kept = [line for line in capsys.readouterr().err.splitlines() if "keeps" in line]
+    assert kept == [f"both: keeps what it holds of {name}/run.mcap besides: bundle=none" for name in ("first", "second")]
     assert main([*record, "dataset.seed=1", "out=first"]) == 0  # anew: what is known of it is of another recording now
     assert main(["ablate", "first", "bundle=none", "out=found"]) == 0
     assert "keeps" not in capsys.readouterr().err
@@ -366,7 +384,8 @@ def test_a_wrong_sign_in_translation_is_attributed_to_translation(tmp_path, caps
     assert abs(shares["manhattan"]) < 0.05 * shares["translation"]
     mutated = next(one for one in found["recordings"][0]["variants"] if one["change"] == "translation=wrong_sign")
     assert (mutated["parting"]["topic"], mutated["parting"]["field"]) == ("translation", "t_world_camera")
-    assert Path(mutated["picture"]).stat().st_size > 10_000
+    picture = cv2.imread(mutated["picture"])
+    assert picture.std() > 10.0 and (picture[:2] == 255).all()  # no title is cut off
     before = {path: path.stat().st_mtime_ns for path in (tmp_path / "ablation").rglob("*") if path.name != "ablation.json"}
     assert found["verdicts"][0]["text"].endswith(": too short to tell") and found["verdicts"][0]["figure"] == "ATE mm"
     first = capsys.readouterr().out

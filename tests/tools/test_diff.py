@@ -48,10 +48,13 @@ def diff(capsys, *words):
 def test_equal_recordings_of_different_ranges_and_topics(tmp_path, capsys):
     a, b = record(tmp_path / "a.mcap", range(10)), record(tmp_path / "b.mcap", range(4, 15))
     assert diff(capsys, a, a) == (0, ["equal: 10 frames (0..9) of pose, map"])
-    assert diff(capsys, a, b) == (0, ["equal: 6 frames (4..9) of pose, map"])
+    lacking = [f"{a} lacks 5 frames of the other (10..14)", f"{b} lacks 4 frames of the other (0..3)"]
+    assert diff(capsys, a, b) == (0, [*lacking, "equal: 6 frames (4..9) of pose, map"])
+    assert diff(capsys, a, b, "--topics", "pose") == (0, [*lacking, "equal: 6 frames (4..9) of pose"])
     c = record(tmp_path / "c.mcap", range(3), topics=("pose",))
-    assert diff(capsys, c, a) == (0, [f"{c} has no map", "equal: 3 frames (0..2) of pose"])
-    assert diff(capsys, c, a, "--tolerance", "0") == (0, [f"{c} has no map", "equal within 0: 3 frames (0..2) of pose"])
+    lacking = [f"{c} has no map", f"{c} lacks 7 frames of the other (3..9)"]
+    assert diff(capsys, c, a) == (0, [*lacking, "equal: 3 frames (0..2) of pose"])
+    assert diff(capsys, c, a, "--tolerance", "0") == (0, [*lacking, "equal within 0: 3 frames (0..2) of pose"])
 
 
 def test_topics_that_were_not_asked_for_are_not_spoken_of(tmp_path, capsys):

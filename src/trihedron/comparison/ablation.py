@@ -101,9 +101,6 @@ def ablate(options: Options) -> list[Case]:
     known, keys, cases = known_cases(options.out), [], []
     for number, work in enumerate(works_of(options, known), 1):
         recording = work.computing.recording
-        for key, other in known.items():
-            if key != work.key and _is_of(other, recording):
-                print(f"{options.out}: keeps what it holds of this recording besides: {' '.join(other.get('swaps', []))}", file=sys.stderr)
         if work.errors is not None:
             print(f"{recording.path}: done already", file=sys.stderr)
             case = tables.case_from_dict(known[work.key])
@@ -121,6 +118,9 @@ def ablate(options: Options) -> list[Case]:
         cases.append(case)
         keys.append(work.key)
         _write(options.out, {**known, **dict(zip(keys, map(tables.case_to_dict, cases)))})
+    for key, other in known.items():
+        if key not in keys:
+            print(f"{options.out}: keeps what it holds of {other['recording']} besides: {' '.join(other.get('swaps', []))}", file=sys.stderr)
     if options.pictures:
         _draw_farthest(cases)
     _write(options.out, {**known, **dict(zip(keys, map(tables.case_to_dict, cases)))})
@@ -143,10 +143,12 @@ def works_of(options: Options, known: Mapping[str, Any]) -> Iterator[Work]:
 
 
 def _check_folders(out: Path, folders: Sequence[Path], recording: Recording, known: Iterable[Mapping[str, Any]]) -> None:
-    """Raise DataError where the folders hold alternatives of another recording."""
+    """Raise DataError where the folders hold alternatives of another recording, or the outer one is that of a run."""
+    if (out / RECORDING).exists():
+        raise DataError(str(out), "is the folder of a run", "give another out=DIR")
     for case in known:
         if not _is_of(case, recording) and not {str(folder) for folder in folders}.isdisjoint(one["folder"] for one in case["variants"]):
-            raise DataError(str(out), f"holds the ablation of {case['recording']}", "give another out=DIR, or remove it")
+            raise DataError(str(out), f"holds the ablation of {case['recording']}", "give another out=DIR")
 
 
 def _is_of(case: Mapping[str, Any], recording: Recording) -> bool:

@@ -74,16 +74,26 @@ def _value(values: Mapping[str, Any], topic: str, index: int) -> Value | None:
 
 
 def distance(x: Value | None, y: Value | None) -> tuple[float, str] | None:
-    """Return the distance of two poses or translations (mm), rotations or Manhattan frames (deg), with its unit; None for other values."""
+    """Return the distance of two poses or translations (mm), rotations or Manhattan frames (deg), with its unit; None for other values, and where one
+    was not estimated."""
+    if not (is_estimated(x) and is_estimated(y)):
+        return None
     if isinstance(x, Pose) and isinstance(y, Pose):
         return 1e3 * float(np.linalg.norm(x.T_world_camera[:3, 3] - y.T_world_camera[:3, 3])), "mm"
     if isinstance(x, Translation) and isinstance(y, Translation):
         return 1e3 * float(np.linalg.norm(x.t_world_camera - y.t_world_camera)), "mm"
     if isinstance(x, Rotation) and isinstance(y, Rotation):
         return _angle_deg(x.R_world_camera.T @ y.R_world_camera), "deg"
-    if isinstance(x, ManhattanFrame) and isinstance(y, ManhattanFrame) and len(x.rotations) and len(y.rotations):
+    if isinstance(x, ManhattanFrame) and isinstance(y, ManhattanFrame):
         return _angle_deg(x.rotations[0].T @ nearest_equivalent(y.rotations[0], x.rotations[0])), "deg"
     return None
+
+
+def is_estimated(value: Any) -> bool:
+    """Return True for a value that was estimated from its frame: an unsupported Manhattan frame and a translation that was only predicted are not."""
+    if isinstance(value, ManhattanFrame):
+        return value.supported and len(value.rotations) > 0
+    return isinstance(value, Value) and (not isinstance(value, Translation) or value.estimated)
 
 
 def _angle_deg(R: F64) -> float:
@@ -109,7 +119,7 @@ class StageErrors:
         """Add the value of the stage in the next frame, measured beside its inputs there: recorded values, and computed ones where none is recorded.
         Values that other swapped stages compute are not its inputs."""
         value, now = values.get(topic), None
-        self.seen, self.present = self.seen + 1, self.present + isinstance(value, Value)
+        self.seen, self.present = self.seen + 1, self.present + is_estimated(value)
         if isinstance(value, Value) and (T := self.truth.get(value.stamp_ns)) is not None:
             recorded = {name.removeprefix(RECORDED): item for name, item in values.items() if name.startswith(RECORDED)}
             now = Seen({**values, **recorded, "map": self._map, topic: value}, T)
@@ -117,9 +127,9 @@ class StageErrors:
                 self.measures.setdefault(column, {})[self.frames] = error
             if isinstance(value, Rotation):
                 self.rotations_deg[self.frames] = _angle_deg(T[:3, :3].T @ value.R_world_camera)
-            elif isinstance(value, Translation) and value.estimated:
+            elif isinstance(value, Translation) and is_estimated(value):
                 self.translations_m[self.frames] = float(np.linalg.norm(T[:3, 3] - value.t_world_camera))
-            elif isinstance(value, ManhattanFrame) and value.supported and len(value.rotations):
+            elif isinstance(value, ManhattanFrame) and is_estimated(value):
                 self.axes[self.frames] = T[:3, :3] @ value.rotations[0]
         self._before, self.frames = now, self.frames + 1
         self._map = values.get(RECORDED + "map") or self._map

@@ -51,13 +51,14 @@ def draw_pair(sides: Sequence[tuple[str, Sequence[Recording]]], frame: int, out:
     """Draw one frame of two runs beside each other, with both paths from above. A side is a title and the recordings in which its topics are looked
     up, the first that has one; the last holds the images."""
     from matplotlib.figure import Figure
+    from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-    figure = Figure(figsize=(15, 4.2), layout="constrained")
+    figure = Figure(figsize=(15, 4.2), layout=ConstrainedLayoutEngine(h_pad=PAD_INCHES))
     axes = figure.subplots(1, 3)
     for side, (title, recordings) in zip(axes, sides):
         side.imshow(_annotate_frame(recordings, frame))
         side.set_axis_off()
-        side.set_title(f"frame {frame}: {title}", fontsize=10)
+        side.set_title(f"frame {frame}: {title}{_lacking(recordings, frame)}", fontsize=10)
     for (title, recordings), color, style in zip(sides, PAIR_COLORS, ("-", "--")):
         _path_from_above(axes[2], _values(recordings, "pose"), frame, title, color, style)
     axes[2].set_aspect("equal", adjustable="datalim")
@@ -66,6 +67,13 @@ def draw_pair(sides: Sequence[tuple[str, Sequence[Recording]]], frame: int, out:
     axes[2].legend(loc="best", fontsize=8)
     with new_file(out) as new:
         figure.savefig(new, dpi=80)
+
+
+def _lacking(recordings: Sequence[Recording], frame: int) -> str:
+    """Say that a run found no Manhattan frame in a frame, whose picture then has no axes."""
+    reference = recordings[-1].reference(frame)
+    found = _value(recordings, "manhattan", reference.stamp_ns) if reference is not None else None
+    return ", no Manhattan frame" if found is not None and not found.supported else ""
 
 
 def _path_from_above(axes: Any, poses: Iterable[Any], frame: int, title: str, color: str, style: str) -> None:
