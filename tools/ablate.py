@@ -37,7 +37,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--dry-run", action="store_true", help="say what each alternative computes, reads and shares; compute nothing")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write figures and tables there too")
     parser.add_argument("--markdown", type=Path, metavar="FILE", help="write the tables there too")
-    given = parser.parse_intermixed_args(argv)
+    given = parser.parse(argv)
     options = options_of(given.words, given.budget)
     if given.dry_run:
         works = works_of(options, known_cases(options.out))

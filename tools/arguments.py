@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import inspect
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import NoReturn
 
 from trihedron.pipeline.core.errors import UsageError, did_you_mean
@@ -30,6 +30,10 @@ class Parser(argparse.ArgumentParser):
 
         every = ",".join(known)
         self.add_argument("--parts", type=some, default=every, metavar="A,B", help=f"some of them (default: {every})")
+
+    def parse(self, argv: Sequence[str]) -> argparse.Namespace:
+        """Return the arguments; options may stand between words. Raises UsageError."""
+        return self.parse_intermixed_args(argv)
 
     def error(self, message: str) -> NoReturn:
         """Raise UsageError, with the command's own help as the cure."""

@@ -31,7 +31,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--edits", metavar="FILE", help="a building.json that was corrected by hand; what was changed there is kept")
     parser.add_argument("--out", metavar="FOLDER", type=Path, help="where to write (default: beside the recording)")
     parser.add_argument("--pdf", action="store_true", help="write floorplan.pdf too, to scale")
-    options = parser.parse_args(argv)
+    options = parser.parse(argv)
     from trihedron.pipeline.core.libraries import library_error
     from trihedron.pipeline.core.registry import load_plugins, plugins_of
     from trihedron.pipeline.record.mcap_file import RECORDING, recording_file

@@ -58,7 +58,7 @@ def main(argv: list[str]) -> int:
     parser = Parser("calibrate", __name__)
     parser.add_argument("recording", metavar="RUN.mcap", type=Path)
     parser.add_argument("--out", metavar="CAMERA.yaml", type=Path, help="write a camera file with what is recommended")
-    arguments = parser.parse_args(argv)
+    arguments = parser.parse(argv)
     recording = Recording(arguments.recording)
     recorded = read_recording(recording)
     used = calibration_in_use(recording, recorded.camera)

@@ -26,7 +26,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("words", metavar="KEY=VALUE", nargs="*", help="options, as for trihedron run")
     parser.add_argument("--quick", action="store_true", help="leave out other processes and the replay")
     parser.add_argument("--digest", action="store_true", help="print the SHA-256 of the values in the room, and nothing else")
-    arguments = parser.parse_intermixed_args(argv)
+    arguments = parser.parse(argv)
     from trihedron.tools.plugin_check import PluginCheck
 
     check = PluginCheck(arguments.slot, arguments.plugin, tuple(arguments.words))

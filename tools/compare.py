@@ -39,7 +39,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--surfaces", action="store_true", help="judge each surface.ply that was not yet (as evaluate-surface does)")
     for name in render.WRITERS:
         parser.add_argument(f"--{name}", type=Path, metavar="FILE", help="write the table there too")
-    options = parser.parse_intermixed_args(argv)
+    options = parser.parse(argv)
     folders, files = [path for path in options.folders if not path.is_file()], [path for path in options.folders if path.is_file()]
     if not folders:
         raise UsageError("compare", "there are trajectories and no run", "give the folder of a run of the same data set before them")

@@ -18,7 +18,7 @@ def main(argv: list[str]) -> int:
     """Run the command; returns the exit code. Raises TrihedronError where a process fails."""
     parser = Parser("compile", __name__)
     parser.add_argument("--archive", type=Path, metavar="FOLDER", help="write the machine code for a wheel here, and cache nothing")
-    options = parser.parse_args(argv)
+    options = parser.parse(argv)
     from trihedron.pipeline.app.compilation import compile_for_wheel, compile_kernels
     from trihedron.pipeline.core.machine_code import archive, archive_name
 

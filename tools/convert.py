@@ -33,7 +33,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--camera", metavar="PRESET|FILE", help="as dataset.camera of trihedron run")
     parser.add_argument("--frames", metavar="A:B[:S]", default="", help="only this half-open range of frames, or every S-th of it")
     parser.add_argument("--overwrite", action="store_true", help="replace DST.mcap if it exists")
-    arguments = parser.parse_args(argv)
+    arguments = parser.parse(argv)
     destination: Path = arguments.destination
     if destination.suffix != SUFFIX:
         raise UsageError("convert", f"'{destination}' does not end in {SUFFIX}", f"give for example {destination.name or 'far'}{SUFFIX}")

@@ -33,7 +33,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("b", metavar="B.mcap", type=Path)
     parser.add_argument("--topics", metavar="TOPIC,...", default="", help="(default: all that both have)")
     parser.add_argument("--tolerance", metavar="T", type=float, help="list every field that differs, and call equal what differs by T at most")
-    arguments = parser.parse_args(argv)
+    arguments = parser.parse(argv)
     if arguments.tolerance is not None and not 0.0 <= arguments.tolerance < np.inf:
         raise UsageError("--tolerance", f"{arguments.tolerance:g} is not a tolerance", "give a number from 0")
     a, b = Recording(arguments.a), Recording(arguments.b)

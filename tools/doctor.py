@@ -22,7 +22,7 @@ from trihedron.tools.system_check import OPTIONAL, REQUIRED, check
 
 def main(argv: list[str]) -> int:
     """Run the command; returns the exit code."""
-    Parser("doctor", __name__).parse_args(argv)
+    Parser("doctor", __name__).parse(argv)
     libraries = declared_requirements()
     missing = [name for name in libraries.get("", ()) if version_of(name) is None]
     broken = {module: problem for module in (*REQUIRED, *OPTIONAL) if find_spec(module) is not None and (problem := check(module))}

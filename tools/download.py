@@ -72,7 +72,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--max-gb", type=float, metavar="N", help="largest archive; unpacked at most four times as much (default: the collection's)")
     parser.add_argument("--repin", action="store_true", help="accept an archive whose checksum is not the pinned one, and pin it")
     parser.add_argument("--keep", action="store_true", help="keep the archive in the cache (those of several sequences are kept anyway)")
-    options = parser.parse_args(argv)
+    options = parser.parse(argv)
     if not options.names or (len(options.names) == 1 and options.names[0] in catalog()):
         print(listing(options.names[0] if options.names else ""))
         return 0

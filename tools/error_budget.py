@@ -30,7 +30,7 @@ def main(argv: list[str]) -> int:
     """Print the table; returns the exit code. Raises DataError for a recording without poses or truth, StageError when a replay fails."""
     parser = Parser("error-budget", __name__)
     parser.add_argument("recording", metavar="RUN.mcap", type=Path, help="of a run whose data set has ground truth")
-    found = reruns(Recording(parser.parse_args(argv).recording))
+    found = reruns(Recording(parser.parse(argv).recording))
     rows: list[list[str]] = [["true", "ATE RMSE (m)", "× whole", "RPE over 1 s (m)", "(deg)"]]
     whole = found[()].metrics.get(ATE) or np.nan
     for stages, one in found.items():

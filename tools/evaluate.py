@@ -43,7 +43,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--frames", type=Path, help="all frames of the data set: a file whose lines begin with a stamp (rgb.txt), or a recording")
     parser.add_argument("--y-up", action="store_true", help="mirror TRUTH, whose y axis points up")
     parser.add_argument("--max-difference-ms", type=float, default=20.0, help="largest time between a pose and its truth (default: 20)")
-    arguments = parser.parse_args(argv)
+    arguments = parser.parse(argv)
     if arguments.no_reference != (arguments.truth is None):
         cause = "--no-reference takes no TRUTH" if arguments.no_reference else "the following arguments are required: TRUTH"
         raise UsageError("evaluate", cause, "see trihedron evaluate --help")

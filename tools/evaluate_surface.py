@@ -31,7 +31,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("mesh", metavar="MESH", type=Path, help="a run folder or a mesh file")
     parser.add_argument("truth", metavar="TRUTH", type=Path, nargs="?", help="the run's recording or folder (default: that of MESH)")
     parser.add_argument("--json", action="store_true", help="print every figure as JSON")
-    arguments = parser.parse_args(argv)
+    arguments = parser.parse(argv)
     mesh: Path = arguments.mesh / SURFACE if arguments.mesh.is_dir() else arguments.mesh
     truth: Path = arguments.truth or mesh.parent
     figures = evaluate_files(mesh, recording_file(truth))

@@ -53,7 +53,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--out", metavar="FILE", type=Path, help="(default: in the run folder)")
     for flag, meaning in FLAGS.items():
         parser.add_argument(f"--{flag}", action="store_true", help=meaning)
-    arguments = parser.parse_args(argv)
+    arguments = parser.parse(argv)
     name = BY_ENDING.get(arguments.to, arguments.to)
     if name not in formats():
         plan = f"trihedron building {arguments.run} writes it" if name in OF_BUILDINGS else ""

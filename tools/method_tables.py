@@ -43,7 +43,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("folders", nargs="+", type=Path, metavar="FOLDER", help="of sweeps by experiment=methods")
     parser.add_argument("--detectors", type=Path, metavar="FILE", help="of: trihedron benchmark detectors --json FILE; goes to --json too")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures")
-    options = parser.parse_intermixed_args(argv)
+    options = parser.parse(argv)
     rows, failures = [], []
     judge_surfaces(options.folders)
     for folder in options.folders:

@@ -122,7 +122,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("slot", metavar="SLOT")
     parser.add_argument("name", metavar="NAME", help="of the plugin, as in SLOT=NAME")
     parser.add_argument("--out", type=Path, metavar="FOLDER", help="default: trihedron-NAME")
-    arguments = parser.parse_args(argv)
+    arguments = parser.parse(argv)
     slot, name = arguments.slot, arguments.name
     folder = arguments.out or Path(f"trihedron-{name.replace('_', '-')}")
     files = package_of(slot, name)

@@ -69,7 +69,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("folders", nargs="+", type=Path, metavar="RUNS", help="of sweeps, or of single runs")
     parser.add_argument("--markdown", type=Path, metavar="FILE", help="write the tables there too")
     parser.add_argument("--no-surfaces", action="store_true", help="do not judge surfaces that were not judged yet")
-    options = parser.parse_intermixed_args(argv)
+    options = parser.parse(argv)
     if not options.no_surfaces:
         judge_surfaces(options.folders)
     tables = tables_of(known_of(options.folders))

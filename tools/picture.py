@@ -17,7 +17,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("recording", help="run.mcap")
     parser.add_argument("--frame", type=int, default=-1, metavar="N", help="frame number (default: the middle one)")
     parser.add_argument("--out", default="picture.png", metavar="FILE", help="default picture.png")
-    options = parser.parse_args(argv)
+    options = parser.parse(argv)
     draw(options.recording, options.frame, Path(options.out))
     print(options.out)
     return 0

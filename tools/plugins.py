@@ -26,7 +26,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("slot", metavar="SLOT", nargs="?", help="only this slot")
     parser.add_argument("plugin", metavar="PLUGIN", nargs="?", help="only this plugin of it, with its options")
     parser.add_argument("--json", action="store_true", help="print everything as JSON")
-    arguments = parser.parse_args(argv)
+    arguments = parser.parse(argv)
     from trihedron.pipeline.core.registry import broken_packages, load_plugins
     from trihedron.pipeline.core.slots import SLOTS
 

@@ -19,7 +19,7 @@ def main(argv: list[str]) -> int:
     parser = Parser("recover", __name__)
     parser.add_argument("file", metavar="FILE.mcap", type=Path)
     parser.add_argument("--out", metavar="FILE", type=Path, help="write this file and leave the other as it is")
-    arguments = parser.parse_args(argv)
+    arguments = parser.parse(argv)
     out: Path = arguments.out or arguments.file
     print(f"{out}: {recover(arguments.file, out)}")
     return 0

@@ -37,7 +37,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("folders", nargs="+", type=Path, metavar="FOLDER", help="of runs, or of a sweep")
     parser.add_argument("--out", type=Path, default=Path("report.html"), metavar="FILE", help="default report.html")
     parser.add_argument("--title", metavar="TEXT", help="default: the data set and the names of the runs")
-    options = parser.parse_intermixed_args(argv)
+    options = parser.parse(argv)
     runs = read_runs(*options.folders)
     write_file(options.out, page(runs, options.title))
     print(options.out)

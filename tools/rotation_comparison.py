@@ -25,7 +25,7 @@ def main(argv: list[str]) -> int:
     parser = Parser("benchmark rotations", __name__)
     parser.add_argument("folder", type=Path, help="of the alternatives")
     parser.add_argument("--frame", type=int, metavar="N", help="whose sphere is drawn (default: the middle one)")
-    options = parser.parse_args(argv)
+    options = parser.parse(argv)
     print(compare(options.folder, options.frame))
     return 0
 

@@ -91,7 +91,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--check", type=Path, metavar="BAND", help="exit with 1 when a cell leaves its band")
     parser.add_argument("--write-band", type=Path, metavar="BAND", help="write the band of these runs")
     parser.add_argument("--no-pictures", action="store_true", help="leave out the pictures of frames")
-    options = parser.parse_intermixed_args(argv)
+    options = parser.parse(argv)
     cells = cells_of(read_runs(*options.folders))
     if options.baseline and options.baseline not in (systems := {cell.system for cell in cells}):
         raise UsageError("--baseline", f"no row is '{options.baseline}'", did_you_mean(options.baseline, systems))

@@ -33,7 +33,7 @@ def main(argv: list[str]) -> int:
     """Run the command; returns the exit code. Raises RecordingError for a file that is missing, cut off or no MCAP."""
     parser = Parser("topics", __name__)
     parser.add_argument("file", metavar="FILE.mcap", type=Path, help="or the folder of a run")
-    found = topics_of(parser.parse_args(argv).file)
+    found = topics_of(parser.parse(argv).file)
     rows: list[list[str]] = [["topic", "schema", "messages", "first (s)", "last (s)", "bytes"]]
     for topic in found:
         first, last = (f"{stamp_ns / 1e9:.6f}" for stamp_ns in (topic.first_ns, topic.last_ns))

@@ -39,7 +39,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--host", default=LOOPBACK, help="the address to listen on (default: 127.0.0.1, this machine alone)")
     parser.add_argument("--port", type=int, default=PORT, help="of the data (default: 9876)")
     parser.add_argument("--web-port", type=int, default=WEB_PORT, help="of the page (default: 9090)")
-    arguments = parser.parse_args(argv)
+    arguments = parser.parse(argv)
     run: Path = arguments.run
     require_rerun()
     path = recording_file(run)

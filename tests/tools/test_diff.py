@@ -50,7 +50,7 @@ def test_equal_recordings_of_different_ranges_and_topics(tmp_path, capsys):
     assert diff(capsys, a, a) == (0, ["equal: 10 frames (0..9) of pose, map"])
     lacking = [f"{a} lacks 5 frames of the other (10..14)", f"{b} lacks 4 frames of the other (0..3)"]
     assert diff(capsys, a, b) == (0, [*lacking, "equal: 6 frames (4..9) of pose, map"])
-    assert diff(capsys, a, b, "--topics", "pose") == (0, [*lacking, "equal: 6 frames (4..9) of pose"])
+    assert diff(capsys, a, "--topics", "pose", b) == (0, [*lacking, "equal: 6 frames (4..9) of pose"])
     c = record(tmp_path / "c.mcap", range(3), topics=("pose",))
     lacking = [f"{c} has no map", f"{c} lacks 7 frames of the other (3..9)"]
     assert diff(capsys, c, a) == (0, [*lacking, "equal: 3 frames (0..2) of pose"])

@@ -66,7 +66,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--anew", action="store_true", help="make the plans of runs anew from what they recorded; final s is then CPU time")
     parser.add_argument("--true-poses", action="store_true", help="track nothing: make the plans at the true poses of the walk")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures of each run too")
-    options = parser.parse_args(argv)
+    options = parser.parse(argv)
     if not 1 <= options.seeds <= 100:
         raise UsageError("benchmark building", f"--seeds {options.seeds} is out of range", "give 1 to 100")
     if options.first_seed < 0:

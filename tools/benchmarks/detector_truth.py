@@ -81,7 +81,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--slots", default=",".join(JUDGES), metavar="A,B", help="some of them (default: all)")
     parser.add_argument("--pairs", type=int, default=5, metavar="N", help="of frames in each scene (default: 5)")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures too")
-    options = parser.parse_args(argv)
+    options = parser.parse(argv)
     if not 1 <= options.pairs <= 100:
         raise UsageError("benchmark detectors", f"--pairs {options.pairs} is out of range", "give 1 to 100")
     for slot in options.slots.split(","):

@@ -62,7 +62,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--orientations", type=int, default=100, metavar="N", help="views of each room (default: 100)")
     parser.add_argument("--estimators", default="", metavar="A,B", help="some of them (default: all that are registered)")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures too")
-    options = parser.parse_args(argv)
+    options = parser.parse(argv)
     if options.orientations not in ORIENTATIONS:
         raise UsageError("benchmark manhattan", f"--orientations {options.orientations} is out of range", f"give 1 to {ORIENTATIONS[-1]}")
     load_plugins()

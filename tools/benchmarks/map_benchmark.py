@@ -60,7 +60,7 @@ def main(argv: list[str]) -> int:
     parser.add_parts(PARTS)
     parser.add_argument("--sequences", default="", metavar="KIND:FOLDER,...", help="to cover besides the built-in rooms, by plugin")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures too")
-    options = parser.parse_args(argv)
+    options = parser.parse(argv)
     figures: dict[str, Any] = {"machine": machine()}
     with tempfile.TemporaryDirectory() as folder:
         for part in options.parts:

@@ -34,7 +34,7 @@ def main(argv: list[str]) -> int:
     """Print the table; returns the exit code. Raises UsageError for a number of calls out of range."""
     parser = Parser("benchmark parts", __name__)
     parser.add_argument("--calls", type=int, default=50, metavar="N", help="calls of each part (default: 50)")
-    options = parser.parse_args(argv)
+    options = parser.parse(argv)
     if options.calls not in CALLS:
         raise UsageError("benchmark parts", f"--calls {options.calls} is out of range", f"give {CALLS[0]} to {CALLS[-1]}")
     cv2.setNumThreads(1)

@@ -65,7 +65,7 @@ def main(argv: list[str]) -> int:
         metavar="FILE.json",
         help="read such files instead of measuring; of two the later counts",
     )
-    options = parser.parse_args(argv)
+    options = parser.parse(argv)
     _folders(options.json, options.png)
     figures: dict[str, Any] = {"machine": machine()}
     if options.draw:

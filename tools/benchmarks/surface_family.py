@@ -39,7 +39,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--surfaces", default="", metavar="A,B", help="some of them (default: all that are registered)")
     parser.add_argument("--run", type=Path, metavar="FOLDER", help="a run of this room with record.frames=true, instead of a new one")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures too")
-    options = parser.parse_args(argv)
+    options = parser.parse(argv)
     if not 10 <= options.frames <= 100_000:
         raise UsageError("benchmark surface", f"--frames {options.frames} is out of range", "give 10 to 100000")
     load_plugins()
