@@ -97,6 +97,24 @@ def test_what_is_seen_while_lost_becomes_a_sub_map_and_is_tied_when_the_turn_is_
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("covered", ["150:290", "150:225"])
+def test_a_camera_that_is_found_in_a_room_like_the_one_it_was_lost_in_is_put_right(tmp_path, capsys, covered):
+    """Two identical offices on a corridor. The camera is covered on the way from the first to the second, until it is in that one (then it is found in
+    the first), or until it is before its door (then a sub-map is merged with the first). No image shows the mistake until it leaves."""
+    options = {"scene": "offices", "fps": 10, "width": 320, "height": 240}
+    metrics, poses = run(tmp_path / "run", "synthetic", options, "", f"dataset.cover={covered}")
+    truth = true_poses(Synthetic(scene=Scene.offices, fps=10.0, width=320, height=240))
+    wrong = [index for index, pose in poses.items() if pose.status == "ok" and np.linalg.norm((pose.T_world_camera - truth[index])[:3, 3]) > 0.1]
+    parted = next(index for index, pose in poses.items() if "found again in a place that looks the same" in pose.reason)
+    print(f"ok in the wrong office from frame {wrong[0]} to {wrong[-1]}, parted at {parted}, ATE {metrics['final']['ate_rmse_m']:.4f} m")
+    assert 355 < parted < 370 and max(wrong) < parted  # it looks out of the door at 358
+    assert metrics["final"]["ate_rmse_m"] < 0.02 and metrics["unmerged"] < 10
+    assert "the camera that was lost in frame 150 was found in another place; what it mapped since is sub-map 1\n" in capsys.readouterr().err
+    assert main(["run", f"replay={tmp_path / 'run' / 'run.mcap'}", "only=[matches,pose,map]", f"out={tmp_path / 'again'}"]) == 0
+    assert main(["diff", str(tmp_path / "run"), str(tmp_path / "again"), "--topics", "matches,pose,map"]) == 0
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("texture", ["true", "false"])
 def test_views_of_the_room_are_recognised_where_they_were_mapped_and_nowhere_else(tmp_path, texture):
     """A map of five seconds (ten, where the room is bare) and views of the next minute, which turns once around: seen before when a keyframe looked

@@ -318,7 +318,9 @@ class Pose(Value):
     landmarks made from this pose count it in their weights.
 
     `repeats` is the number of images in a row, up to this one, that repeat the one before bit for bit; `disagreement` the share of the matched points
-    that do not agree with their frame's pose, as a moving average over ten frames.
+    that do not agree with their frame's pose, as a moving average over ten frames. `lost_from` is the number of the first frame of the latest loss, 0
+    for none, and `missing` the share of the points mapped before it that should have been matched since the camera was found again and were not, as a
+    moving average over a thousand of them.
 
     Five fields are what the pose's error owes to an imperfect calibration (`plugins.shared.calibration_error`, which defines the parameters and their
     units): `sensitivity` is the derivative of the error by them, `calibration_information` and `calibration_score` the information of the residuals
@@ -348,6 +350,8 @@ class Pose(Value):
     calibration_score: Annotated[F64, Shape(CALIBRATION), Finite()] = field(default_factory=lambda: np.zeros(CALIBRATION))
     disagreement: Annotated[float, Within(0.0, 1.0)] = 0.0
     keyframe_covariance: Annotated[F64, Shape(6, 6), Finite()] = field(default_factory=lambda: np.zeros((6, 6)))
+    lost_from: Annotated[int, Within(0, 2**31)] = 0
+    missing: Annotated[float, Within(0.0, 1.0)] = 0.0
 
     @property
     def local_covariance(self) -> F64:

@@ -92,7 +92,8 @@ def _equations(pose: Pose, solution: PoseSolution, problem: MapAlignment) -> Equ
     keyframes = Keyframes(np.ascontiguousarray(poses[:, :3, :3]), np.ascontiguousarray(poses[:, :3, 3]), twists, errors)
     points, _, planes = problem.terms(T)
     samples = map.planes.rows("samples_m", problem.plane_ids())
+    surfaces = problem.surfaces_at(problem.keypoints.pixels[problem.matches.keypoints[:, 0]])
     return calibration_equations(
         T, camera.intrinsics, camera.width, camera.height, calibration_scales(camera), pose.twist, points, planes,
-        Flags(solution.points, solution.lines, solution.planes), problem.surfaces(), samples, observers, keyframes,
+        Flags(solution.points, solution.lines, solution.planes), surfaces, samples, observers, keyframes,
     )  # fmt: skip

@@ -8,7 +8,8 @@ status, with its figures:
 - **Contradiction**: what disagrees is not explained by something that moves (`dynamic_objects.py` asks static matches, and planes), and the residuals
   so far do not contradict the camera's calibration (`calibration_uncertainty.py`).
 - **Continuity**: the rotation was measured, and the frame continues the previous one, or the map knows its details: of a place that is built alike,
-  walls and lines agree, and points do not.
+  walls and lines agree, and points do not. A camera that was found again keeps finding what was mapped before it was lost; in a room like the one it
+  was taken to be in, it does until it leaves.
 - **Freshness**: an image that repeats the one before measures nothing.
 
 Limits are options of `pose=refine`, or the constants below. `trihedron benchmark honesty` counts the clean frames that each test degrades (false
@@ -19,18 +20,25 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
+from trihedron.pipeline.core.geometry import invert, transform
 from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat, Share
-from trihedron.pipeline.core.types import DEGRADED, LOST, OK, Keypoints, Planes, Pose, Rotation, Tracks, Translation
+from trihedron.pipeline.core.types import DEGRADED, F64, I32, LOST, OK, Keypoints, Planes, Pose, Rotation, Tracks, Translation
+from trihedron.plugins.mapping.submaps import is_elsewhere
 from trihedron.plugins.pose.calibration_uncertainty import contradicted_calibration
 from trihedron.plugins.pose.dynamic_objects import MovingOptions, Selection, status_with_static
 from trihedron.plugins.pose.map_alignment import InlierStatistics, MapAlignment, TrackingStatus
 from trihedron.plugins.shared.pose_optimizer import PoseSolution
+from trihedron.plugins.shared.residuals_kernels import NEAR_M
 
 DETAILED = 100  # key points, or matches, with which a frame is expected to be recognised by them
 DISAGREEMENT_FRAMES = 10  # that the disagreement of matched points is averaged over
 MOST_DISAGREEMENT = 0.5  # more is no moment of blur and nobody who walks by; at most 0.35 of five cameras and three simulated ones
 BY_CHANCE = 0.15  # of DETAILED matches that agree by chance: after a jump at most 0.08, between frames of a walk at least 0.31
+MISSING_POINTS = 1000.0  # mapped before the camera was lost, that their missing share is averaged over
+SAME_M, SAME_SHARE = 0.05, 0.03  # and share of its depth, from the plane that is observed there, within which a point lies on it
+SAME_VIEW, SAME_DISTANCE = np.cos(np.deg2rad(30.0)), 1.5  # between views of a point, and ratio of their distances, that show the same of it
 BLURRED_PX = 1.0  # blur that is worth a word: with more the covariance is half as large again
 
 
@@ -107,9 +115,9 @@ def status_by_images(status: TrackingStatus, evidence: Evidence, repeats: int) -
 
 
 def judge_by_run(pose: Pose) -> Pose:
-    """Degrade an ok pose that contradicts the run so far: its matched points have disagreed for ten frames, or its residuals contradict the
-    calibration."""
-    reason = (_lasting_disagreement(pose) or contradicted_calibration(pose)) if pose.status == OK else ""
+    """Degrade an ok pose that contradicts the run so far: its matched points have disagreed for ten frames, what was mapped before the latest loss is
+    not there, or the residuals contradict the calibration."""
+    reason = (_lasting_disagreement(pose) or _found_elsewhere(pose) or contradicted_calibration(pose)) if pose.status == OK else ""
     return replace(pose, status=DEGRADED, reason=reason) if reason else pose
 
 
@@ -118,6 +126,47 @@ def disagreement(previous: Pose, inliers: InlierStatistics) -> float:
     if inliers.matched[0] < DETAILED:
         return previous.disagreement
     return previous.disagreement + (1.0 - inliers.inliers[0] / inliers.matched[0] - previous.disagreement) / DISAGREEMENT_FRAMES
+
+
+def since_loss(pose: Pose, previous: Pose) -> Pose:
+    """Give a pose the previous one's `lost_from` and `missing`; the first lost one begins them anew."""
+    if pose.status != LOST:
+        return replace(pose, lost_from=previous.lost_from, missing=previous.missing) if previous.lost_from else pose
+    return replace(pose, lost_from=previous.lost_from if previous.status == LOST else pose.index)
+
+
+def missing_points(previous: Pose, submap: int, problem: MapAlignment, T_world_camera: F64) -> float:
+    """Return the moving average of the share of points mapped before the latest loss that should be matched and are not: the surface that they lie on
+    is observed, from about where they were mapped. It begins anew where the sub-map of the camera was merged or parted since the previous pose."""
+    map, visible = problem.map, problem.matches.visible_points
+    if not previous.lost_from or submap != previous.submap:
+        return 0.0
+    old = visible[map.keyframes.rows("index", map.points.rows("first", visible)) < previous.lost_from]
+    expected = old[_is_observed(problem, old, T_world_camera)]
+    if not len(expected):
+        return previous.missing
+    missing = 1.0 - float(np.isin(expected, problem.matches.keypoints[:, 1]).mean())
+    return previous.missing + (missing - previous.missing) * len(expected) / (len(expected) + MISSING_POINTS)
+
+
+def _is_observed(problem: MapAlignment, points: I32, T_world_camera: F64) -> NDArray[np.bool_]:
+    """Return (n,) True for points of the map that lie on the plane that is observed there, and that the camera sees as their first keyframe did."""
+    map, camera = problem.map, problem.camera
+    positions = map.points.rows("position_m", points)
+    local = transform(invert(T_world_camera), positions)
+    first = map.keyframes.rows("T_world_camera", map.points.rows("first", points))[:, :3, 3]
+    rays, before = positions - T_world_camera[:3, 3], positions - first
+    distance, distance_before = np.linalg.norm(rays, axis=1), np.linalg.norm(before, axis=1)
+    alike = (rays * before).sum(axis=1) > SAME_VIEW * distance * distance_before
+    alike &= (distance < SAME_DISTANCE * distance_before) & (distance_before < SAME_DISTANCE * distance)
+    seen = np.flatnonzero(alike & (local[:, 2] > NEAR_M))
+    depth = local[seen, 2]
+    ray = local[seen] / depth[:, None]
+    surface = problem.surfaces_at(ray[:, :2] * [camera.fx, camera.fy] + [camera.cx, camera.cy])
+    apart = np.abs(surface[:, 3] + depth * (surface[:, :3] * ray).sum(axis=1))  # of the point from the plane; NaN without one
+    out = np.zeros(len(points), bool)
+    out[seen] = apart < np.maximum(SAME_M, SAME_SHARE * depth)
+    return out
 
 
 def repeated_images(previous: Pose, tracks: Tracks | None, keypoints: Keypoints, planes: Planes) -> int:
@@ -157,6 +206,14 @@ def _is_another_place(options: JudgementOptions, problem: MapAlignment, continue
     with_depth = int(np.count_nonzero(np.isfinite(problem.keypoints.points_m[:, 2])))
     expected = min(with_depth, len(problem.matches.visible_points))
     return expected >= DETAILED and continued < options.min_continued * with_depth
+
+
+def _found_elsewhere(pose: Pose) -> str:
+    """Return why the place at which the camera was found again is another one, empty where it shows what was mapped before."""
+    if not is_elsewhere(pose):
+        return ""
+    missing = f"{100.0 * pose.missing:.0f} % of what was mapped before and should be seen is missing"
+    return f"the camera was lost in frame {pose.lost_from}, and found again in a place that looks the same: of late {missing}"
 
 
 def _lasting_disagreement(pose: Pose) -> str:

@@ -8,7 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
-from trihedron.pipeline.core.types import F64, I32, Camera, Keypoints, Map, Matches, Planes, Segments
+from trihedron.pipeline.core.types import F32, F64, I32, Camera, Keypoints, Map, Matches, Planes, Segments
 from trihedron.plugins.mapping.projection import line_terms, plane_terms, point_terms
 from trihedron.plugins.shared.calibration_error_kernels import Observers
 from trihedron.plugins.shared.pose_optimizer import (
@@ -150,10 +150,10 @@ class MapAlignment:
         T, flags = solution.T_world_camera, Flags(solution.points, solution.lines, solution.planes)
         return grouped_equations(T, self.camera, self.terms(T), flags, groups, len(keyframes))
 
-    def surfaces(self) -> F64:
-        """The observed planes (n, 4) that the matched key points lie on; NaN for none."""
+    def surfaces_at(self, pixels: F32 | F64) -> F64:
+        """The observed planes (n, 4) at pixels (n, 2); NaN for none."""
         labels, stride = self.planes.labels, self.planes.stride
-        x, y = np.rint(self.keypoints.pixels[self.matches.keypoints[:, 0]] / stride).astype(int).T
+        x, y = np.rint(pixels / stride).astype(int).T
         label = labels[np.clip(y, 0, labels.shape[0] - 1), np.clip(x, 0, labels.shape[1] - 1)]
         return np.asarray(np.concatenate([np.full((1, 4), np.nan), self.planes.coefficients])[label], np.float64)
 

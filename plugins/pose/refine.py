@@ -35,8 +35,10 @@ from trihedron.plugins.pose.judgement import (
     disagreement,
     is_found_again,
     judge_by_run,
+    missing_points,
     reason_to_be_lost,
     repeated_images,
+    since_loss,
     status_by_images,
     status_by_matches,
 )
@@ -95,11 +97,10 @@ class Refine(JudgementOptions):
             searched = relocalise is not None and translation.estimated
             return self._stay_lost(start, rotation, previous, searched, map, submap)
         if reason := reason_to_be_lost(self, evidence, start.status):
-            return propagate_world_covariance(replace(start, status=LOST, reason=reason).to_pose(rotation, map, submap=submap), previous)
+            return self._unrefined(replace(start, status=LOST, reason=reason).to_pose(rotation, map, submap=submap), previous)
         if not inliers.total:
-            return propagate_world_covariance(
-                start.to_pose(rotation, map, "nothing of the map was found, pose from the previous frame", submap), previous
-            )
+            reason = "nothing of the map was found, pose from the previous frame"
+            return self._unrefined(start.to_pose(rotation, map, reason, submap), previous)
         repeats, status = repeated_images(previous, tracks, keypoints, planes), status_by_matches(self, evidence)
         shared = keyframe_covariance(solution, problem, self.weak_foundation) if status.status == OK else np.zeros((6, 6))
         status = status_by_images(status, evidence, repeats)
@@ -107,8 +108,9 @@ class Refine(JudgementOptions):
         reference, T_reference_camera = reference_of(map, T, submap)
         stamps = rotation.index, rotation.stamp_ns
         pose = Pose(*stamps, T, solution.covariance, T_reference_camera, reference, counts, held, status.status, status.reason, submap)
-        pose = replace(pose, repeats=repeats, keyframe_covariance=shared)
-        return judge_by_run(replace(in_world(pose, previous, solution, problem), disagreement=disagreement(previous, inliers)))
+        pose = in_world(replace(pose, repeats=repeats, keyframe_covariance=shared), previous, solution, problem)
+        missing = missing_points(previous, submap, problem, T)
+        return judge_by_run(replace(pose, disagreement=disagreement(previous, inliers), lost_from=previous.lost_from, missing=missing))
 
     def localising(self) -> Refine:
         """Return the refinement of a camera that begins no sub-map: where the loaded map does not reach it stays lost."""
@@ -134,9 +136,14 @@ class Refine(JudgementOptions):
         definition."""
         unrecognised = previous.unrecognised + int(searched)
         if not self.submap_after or unrecognised < self.submap_after:
-            return propagate_world_covariance(replace(start.to_pose(rotation, map, submap=submap), unrecognised=unrecognised), previous)
+            return self._unrefined(replace(start.to_pose(rotation, map, submap=submap), unrecognised=unrecognised), previous)
         number = int(map.keyframes.column("submap").max(initial=0)) + 1
         reason = f"first frame of sub-map {number}: relocalisation failed for {unrecognised} frames"
         new = replace(start, covariance=FIRST_SIGMA**2 * np.eye(6), status=DEGRADED, reason=reason)
         pose, information = new.to_pose(rotation, map, submap=number), previous.calibration_information
-        return replace(pose, calibration_information=information, calibration_score=previous.calibration_score)
+        pose = replace(pose, calibration_information=information, calibration_score=previous.calibration_score)
+        return since_loss(pose, previous)
+
+    def _unrefined(self, pose: Pose, previous: Pose) -> Pose:
+        """Give a pose that the map did not refine what it takes over from the previous one."""
+        return since_loss(propagate_world_covariance(pose, previous), previous)

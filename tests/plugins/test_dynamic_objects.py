@@ -235,3 +235,21 @@ def test_what_disagrees_for_long_is_a_contradiction(world, map):
         poses[0].reason == f"colour, depth and map contradict each other: of late {100 * poses[0].disagreement:.0f} % of the matched points disagree"
     )
     assert poses[1].status == "ok" and 0.44 < poses[1].disagreement < 0.5
+
+
+def test_what_was_mapped_before_the_camera_was_lost_is_still_there(world, map):
+    """A frame that matches what it should of the map, and one that matches a tenth of it, after a loss in frame 7 and after none."""
+    start, features, matches = matched(world, map)
+    tenth = dataclasses.replace(matches, keypoints=matches.keypoints[::10])
+    before = dataclasses.replace(pose_of(camera_at(STEP - 1), STEP - 1), lost_from=7, missing=0.96)
+
+    def refined(found, previous):
+        return Refine()(world.frame(STEP).camera, *start, None, found, *features, previous, map, None)
+
+    known, other, never = refined(matches, before), refined(tenth, before), refined(tenth, pose_of(camera_at(STEP - 1), STEP - 1))
+    print(known.missing, other.missing, len(matches.visible_points), len(matches.keypoints))
+    assert known.status == "ok" and known.missing < 0.95 and known.lost_from == 7
+    assert other.status == "degraded" and other.missing > 0.95
+    missing = f"of late {100 * other.missing:.0f} % of what was mapped before and should be seen is missing"
+    assert other.reason == f"the camera was lost in frame 7, and found again in a place that looks the same: {missing}"
+    assert never.status == "ok" and (never.lost_from, never.missing) == (0, 0.0)
