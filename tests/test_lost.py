@@ -99,8 +99,8 @@ def test_what_is_seen_while_lost_becomes_a_sub_map_and_is_tied_when_the_turn_is_
 @pytest.mark.slow
 @pytest.mark.parametrize("covered", ["150:290", "150:225"])
 def test_a_camera_that_is_found_in_a_room_like_the_one_it_was_lost_in_is_put_right(tmp_path, capsys, covered):
-    """Two identical offices on a corridor. The camera is covered on the way from the first to the second, until it is in that one (then it is found in
-    the first), or until it is before its door (then a sub-map is merged with the first). No image shows the mistake until it leaves."""
+    """Two identical offices on a corridor. The camera is covered on the way from the first to the second, until it is in that one (it is found in
+    the first), or until it is before its door (a sub-map is merged with the first). No image shows the mistake until it leaves."""
     options = {"scene": "offices", "fps": 10, "width": 320, "height": 240}
     metrics, poses = run(tmp_path / "run", "synthetic", options, "", f"dataset.cover={covered}")
     truth = true_poses(Synthetic(scene=Scene.offices, fps=10.0, width=320, height=240))
