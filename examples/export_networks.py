@@ -13,8 +13,11 @@ from __future__ import annotations
 import sys
 from typing import Any
 
-import torch
-import torch.nn.functional as F
+try:
+    import torch
+    import torch.nn.functional as F
+except ImportError:
+    sys.exit("export_networks: torch: is not installed; give it an environment of its own, as the first lines of this file do")
 
 FEATURES = 1000  # of ALIKED, always; XFeat gives those above its threshold
 NAMES = ["keypoints", "scores", "descriptors"]

@@ -220,6 +220,20 @@ GOOD = np.zeros((120, 160, 3), np.uint8), np.ones((120, 160), np.float32)
             1.0,
             "depth: holds 120 readings that are NaN, infinite or negative; give 0 where there is none: np.nan_to_num(depth)",
         ),
+        (
+            np.zeros((120, 160, 4), np.uint8),
+            GOOD[1],
+            1.0,
+            "rgb: has the shape (120, 160, 4), the camera's images have (120, 160, 3); give rgb[:, :, :3]",
+        ),
+        (
+            np.zeros((3, 120, 160), np.uint8),
+            GOOD[1],
+            1.0,
+            "rgb: has the shape (3, 120, 160), the camera's images have (120, 160, 3); give the channels last: rgb.transpose(1, 2, 0)",
+        ),
+        (GOOD[0], GOOD[1][:, :, None], 1.0, "depth: has the shape (120, 160, 1), the camera's images have (120, 160); give depth[:, :, 0]"),
+        (*GOOD, "0", "t: is str, not a number of seconds; give the time of the frame in seconds"),
         (*GOOD, "now", "t: is str, not a number of seconds; give the time of the frame in seconds"),
         (*GOOD, float("nan"), "t: is nan; give the time of the frame in seconds, 0 or later"),
         (*GOOD, 1.7e18, "t: is 1.7e+18, too large for seconds; divide nanoseconds by 1e9, milliseconds by 1e3"),
@@ -229,6 +243,16 @@ def test_an_argument_that_does_not_fit_is_named(slam, rgb, depth, t, message):
     with pytest.raises(th.TrihedronError) as error:
         slam.track(rgb, depth, t)
     assert str(error.value) == message
+
+
+def test_settings_and_calls_that_make_no_sense_are_refused(slam, tmp_path):
+    with pytest.raises(th.TrihedronError) as error:
+        th.Slam(slam.camera, threads=0)
+    assert str(error.value) == "threads: 0 is not a number of threads; give 1 to 256"
+    with pytest.raises(th.TrihedronError) as error:
+        slam.save(tmp_path / "run.mcap")
+    assert str(error.value) == "Slam.save: no frame was tracked, so there is nothing to save; call track first"
+    assert not (tmp_path / "run.mcap").exists()
 
 
 def test_time_that_goes_back_is_refused_and_any_strides_are_taken(folder, slam):

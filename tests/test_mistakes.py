@@ -47,6 +47,7 @@ MISTAKES = [  # words of the command, exit code, what is said after "trihedron: 
     ("run graph=structual", 1, "graph: there is no graph 'structual'; did you mean 'structural'?"),
     ("run graph.pose=none", 1, "graph.pose: 'none' is not the wires of a stage; choose a plugin with pose=NAME"),
     ("run graph.pose.foo=pose", 1, "graph.pose.foo: there is no such key; see trihedron run --help"),
+    ("run manhatan.cone_deg=8", 1, "manhatan.cone_deg: there is no such key; did you mean 'manhattan'?"),
     ("run outputs=trajectory", 1, "outputs: is not a list; write it as [A,B], quoted for the shell"),
     ("run outputs=[trajectory", 2, "outputs=[trajectory: lacks ] at its end; write 'outputs=[trajectory]'"),
     ("run planes.angle_deg=abc", 1,

@@ -22,7 +22,7 @@ import yaml
 
 from trihedron.datasets.readers.cameras import Calibration, choose_calibration
 from trihedron.datasets.readers.registration import DepthCamera
-from trihedron.pipeline.core.errors import DataError
+from trihedron.pipeline.core.errors import DataError, UsageError
 from trihedron.pipeline.core.files import write_file
 from trihedron.pipeline.core.text_table import table
 from trihedron.pipeline.core.types import F64, CalibrationSigmas, Camera
@@ -59,6 +59,8 @@ def main(argv: list[str]) -> int:
     parser.add_argument("recording", metavar="RUN.mcap", type=Path)
     parser.add_argument("--out", metavar="CAMERA.yaml", type=Path, help="write a camera file with what is recommended")
     arguments = parser.parse(argv)
+    if arguments.out is not None and not arguments.out.absolute().parent.is_dir():
+        raise UsageError("--out", f"the folder {arguments.out.parent} does not exist", "make it first")
     recording = Recording(arguments.recording)
     recorded = read_recording(recording)
     used = calibration_in_use(recording, recorded.camera)
@@ -72,12 +74,23 @@ def main(argv: list[str]) -> int:
     if changed == used and not delay_ms:
         print("no change recommended")
     if changed != used:
-        print("recommended, for camera.yaml:\n" + yaml.safe_dump(_changed_keys(used, changed), sort_keys=False, default_flow_style=None).rstrip())
+        print("recommended, in the place of these keys of camera.yaml:\n" + _as_yaml(_changed_keys(used, changed)).rstrip())
     if arguments.out is not None:
         if not used.depth_scale:
             raise DataError(str(recording.path), "is not of a data set with a camera file", "copy the lines that are printed")
-        write_file(arguments.out, yaml.safe_dump(keys_of(changed), sort_keys=False, default_flow_style=None))
+        write_file(arguments.out, _as_yaml(keys_of(changed)))
+        print(f"written: {arguments.out}" + ("" if changed != used else ", as the camera file in use"))
     return 0
+
+
+def _as_yaml(keys: dict[str, Any]) -> str:
+    """The keys of a camera file, one a line; lists in their line."""
+
+    def line(key: str, value: Any) -> str:
+        nested = isinstance(value, list | dict)
+        return str(yaml.safe_dump({key: value}, sort_keys=False, default_flow_style=None if nested else False))
+
+    return "".join(line(key, value) for key, value in keys.items())
 
 
 def estimate(recorded: Recorded) -> Estimates:
@@ -183,7 +196,8 @@ def report(found: Estimates, camera: Camera) -> str:
         known = bool(np.isfinite(sigma))
         cells = [f"{value:.{decimals}f}", f"{sigma:.{decimals}f}"] if known else ["-", "-"]
         gain = [f"{100 * verdict.gain:.1f} %", f"{100 * verdict.sigma:.1f} %"] if np.isfinite(verdict.sigma) else ["-", "-"]
-        rows.append([label, *cells, *gain, "yes" if verdict.recommended else "no"])
+        applied = "not applied" if name == "readout" else "yes"  # it is estimated so that it does not bias the others
+        rows.append([label, *cells, *gain, applied if verdict.recommended else "no"])
 
     row("colour focal length / depth focal length", float(np.exp(edges[0])), float(edge_sigmas[0]), "registration", 4)
     for k, axis in ((1, "x"), (2, "y")):

@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cache, partial
 from pathlib import Path
@@ -73,10 +73,7 @@ def execute(config: DictConfig, out: Path, overrides: list[str], began: float, k
 
 def _execute(config: DictConfig, out: Path, overrides: list[str], began: float, viewer: Viewer) -> dict[str, Any]:
     forget_peak()
-    if not 1 <= config.threads <= MAX_THREADS:
-        raise ConfigError("threads", f"{config.threads} is not a number of threads", f"give 1 to {MAX_THREADS}")
-    if config.seed < 0:
-        raise ConfigError("seed", f"{config.seed} is negative", "give 0 or more")
+    check_settings(config)
     graph = graph_of(config)
     replay = _replay(config, graph)
     frames = str(config.dataset.get("frames", "")) if config.dataset is not None else ""
@@ -84,6 +81,8 @@ def _execute(config: DictConfig, out: Path, overrides: list[str], began: float, 
     budget, period = budget_of(config, graph), viewer.preview_period
     runner = Runner(graph, config.seed, config.threads, replay, frames, remembered, _pace(config), preview_period=period, budget=budget)
     topics = recorded_topics(config, graph, replay)
+    if replay is not None:
+        _check_words(overrides, graph, runner)
     _announce(runner)
     trial = partial(Runner, graph, config.seed, config.threads, replay, frames, remembered)
     before = FolderBefore.of(out / RECORDING)
@@ -116,6 +115,25 @@ def _execute(config: DictConfig, out: Path, overrides: list[str], began: float, 
     if failure is not None:
         raise failure
     return metrics
+
+
+def check_settings(config: DictConfig) -> None:
+    """Raise ConfigError for a number of threads, or a seed, that is none."""
+    if not 1 <= config.threads <= MAX_THREADS:
+        raise ConfigError("threads", f"{config.threads} is not a number of threads", f"give 1 to {MAX_THREADS}")
+    if config.seed < 0:
+        raise ConfigError("seed", f"{config.seed} is negative", "give 0 or more")
+
+
+def _check_words(words: Sequence[str], graph: Graph, runner: Runner) -> None:
+    """Raise ConfigError for a word of a replay that changes a stage whose values are read: it would change nothing."""
+    read = set(graph.stages) - set(runner.computed) - {"dataset"}
+    for word in words:
+        key = word.lstrip("+~").partition("=")[0]
+        stage = key.removeprefix("graph.").partition(".")[0]
+        if stage in read:
+            computed = ",".join([*(runner.replay.only if runner.replay is not None else ()), stage])
+            raise ConfigError(key, f"{stage} is read from the recording, so this changes nothing", f"add it to the stages: 'only=[{computed}]'")
 
 
 def open_writer(

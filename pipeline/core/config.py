@@ -345,7 +345,8 @@ def _unknown_key(key: str, owner: Any) -> TrihedronError:
             return ConfigError(key, f"view={viewer} has no option '{option}'", _cure_of_option(group, option, VIEWS))
         return ConfigError(key, "no viewer with this option is chosen", f"give view={' or view='.join(VIEWS)} too")
     known = {f.name for f in dataclasses.fields(RunOptions) if f.name not in ("defaults", "hydra")} | set(SLOTS)
-    return ConfigError(key, "there is no such key", did_you_mean(key, known) if not group else "see trihedron run --help")
+    first = key.partition(".")[0]
+    return ConfigError(key, "there is no such key", did_you_mean(first, known) if first not in known else "see trihedron run --help")
 
 
 def _cure_of_option(group: str, option: str, owners: Mapping[str, type[Any]]) -> str:

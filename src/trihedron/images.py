@@ -62,12 +62,25 @@ class Frames:
     def _check_shape(self, name: str, shape: tuple[int, ...], *channels: int) -> None:
         expected = (self.camera.height, self.camera.width, *channels)
         if shape != expected:
-            raise DataError(name, f"has the shape {shape}, the camera's images have {expected}", "give images of the camera's size")
+            raise DataError(name, f"has the shape {shape}, the camera's images have {expected}", _cure_of_shape(name, shape, expected))
+
+
+def _cure_of_shape(name: str, shape: tuple[int, ...], expected: tuple[int, ...]) -> str:
+    size, first = expected[:2], shape[-2:]
+    if shape[:2] == size and len(shape) == 3 and shape[2] > (channels := 3 if len(expected) == 3 else 1):
+        return f"give {name}[:, :, :3]" if channels == 3 else f"give one channel: {name}[:, :, 0]"
+    if shape == (*size, 1):
+        return f"give {name}[:, :, 0]" if len(expected) == 2 else f"give np.repeat({name}, 3, axis=2)"
+    if len(shape) == 3 and first == size:
+        return f"give the channels last: {name}.transpose(1, 2, 0)" if len(expected) == 3 else f"give {name}[0]"
+    return "give images of the camera's size"
 
 
 def stamp_of(t: Any, last_ns: int | None) -> int:
     """Return the time in ns of the argument `t` in seconds, without the rounding of a float. Raises DataError unless it comes after `last_ns`."""
     try:
+        if isinstance(t, str | bytes):
+            raise TypeError
         seconds = operator.index(t) if hasattr(t, "__index__") else float(t)
     except (TypeError, ValueError):
         raise DataError("t", f"is {type(t).__name__}, not a number of seconds", "give the time of the frame in seconds") from None

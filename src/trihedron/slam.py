@@ -26,7 +26,7 @@ from trihedron.datasets.simulation.synthetic import Synthetic
 from trihedron.images import Frames, stamp_of
 from trihedron.pipeline.app.budgets import budget_of
 from trihedron.pipeline.app.compilation import compile_once
-from trihedron.pipeline.app.execute import metadata_of, recorded_topics, remembered_of, source_of, write_files, write_models
+from trihedron.pipeline.app.execute import check_settings, metadata_of, recorded_topics, remembered_of, source_of, write_files, write_models
 from trihedron.pipeline.app.viewers import Viewer, opened_viewer
 from trihedron.pipeline.core import types
 from trihedron.pipeline.core.config import RerunView, check_added, compose_run, graph_of
@@ -115,6 +115,7 @@ class Slam:
         _check_words(words)
         self._config = compose_run(["dataset=pushed", *words])
         self._words = words
+        check_settings(self._config)
         graph = graph_of(self._config)
         self._queue = graph.stages["dataset"].plugin.queue
         self._caller, self._changed = threading.RLock(), threading.Condition()
@@ -312,8 +313,10 @@ class Slam:
         Raises:
             RecordingError: the file cannot be written.
             DataError: it cannot be written, where frames are streamed to `out`.
-            UsageError: another thread is using the object.
+            UsageError: no frame was tracked yet, or another thread is using the object.
         """
+        if self._last < 0:
+            raise UsageError("Slam.save", "no frame was tracked, so there is nothing to save", "call track first")
         self._settle()
         file = Path(path).expanduser()
         if self._out is not None and self._writer is not None:

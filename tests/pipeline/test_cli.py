@@ -144,6 +144,11 @@ def test_a_replay_says_what_it_computed_and_is_not_the_latest_run(capsys, tmp_pa
     assert lines[0] == "not in runs/first/run.mcap, computed again: dataset, normals"
     assert lines[1].startswith("computed: dataset (") and lines[1].endswith(f"manhattan ({count} calls); the rest is read from runs/first/run.mcap")
     assert (tmp_path / "runs" / "latest").resolve() == tmp_path / "runs" / "first"
+    for word in ("planes=cape", "planes.angle_deg=3", "graph.planes.normals=normals"):
+        assert main(["run", "replay=runs/first/run.mcap", "only=[manhattan]", word, "out=runs/third"]) == 1
+        key, cure = word.partition("=")[0], "add it to the stages: 'only=[manhattan,planes]'"
+        assert capsys.readouterr().err == f"trihedron: {key}: planes is read from the recording, so this changes nothing; {cure}\n"
+    assert not (tmp_path / "runs" / "third").exists()
 
 
 @pytest.mark.parametrize("word", ["manhattan.cone_deg=99", "threads=0", "record.topics=[normal]", "dataset=tum"])

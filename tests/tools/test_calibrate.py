@@ -15,7 +15,7 @@ from trihedron.pipeline.app.cli import main
 from trihedron.pipeline.core.types import Camera
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import write_trajectory
-from trihedron.tools.calibrate import Estimates, keys_of, with_estimates
+from trihedron.tools.calibrate import Estimates, _as_yaml, keys_of, with_estimates
 
 CAMERA = Camera(640, 480, 585.0, 585.0, 320.0, 240.0)
 
@@ -80,6 +80,12 @@ def test_the_file_that_is_written_is_read_back(tmp_path):
     given = Calibration(CAMERA, 1000.0, (0.1, 0.0, 0.0, 0.0, 0.0), 0.012, -0.01, depth)
     (tmp_path / "camera.yaml").write_text(yaml.safe_dump(keys_of(given)))
     assert read_camera_file(tmp_path / "camera.yaml") == given
+
+
+def test_keys_are_a_line_each_and_the_folder_of_the_file_is_asked_for_first(tmp_path, capsys):
+    assert _as_yaml({"fx": 523.9, "fy": 523.9, "distortion": [0.1, 0.0]}) == "fx: 523.9\nfy: 523.9\ndistortion: [0.1, 0.0]\n"
+    assert main(["calibrate", "nowhere.mcap", "--out", str(tmp_path / "nowhere" / "camera.yaml")]) == 2
+    assert capsys.readouterr().err == f"trihedron: --out: the folder {tmp_path / 'nowhere'} does not exist; make it first\n"
 
 
 @pytest.mark.slow
