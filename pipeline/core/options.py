@@ -120,8 +120,13 @@ def constraints_of(plugin: type[Any]) -> dict[str, tuple[Constraint, ...]]:
 def check_options(plugin: Any) -> None:
     """Raise ValueError, `OPTION: VALUE is not RANGE`, for the first option of a dataclass instance that is out of its range."""
     for name, constraints in constraints_of(type(plugin)).items():
+        value = getattr(plugin, name)
         for constraint in constraints:
-            if not constraint.permits(value := getattr(plugin, name)):
+            try:
+                permitted = constraint.permits(value)
+            except TypeError:  # of another kind
+                permitted = False
+            if not permitted:
                 raise ValueError(f"{name}: {value!r} is not {constraint}")
 
 

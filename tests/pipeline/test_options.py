@@ -111,3 +111,9 @@ def test_every_declared_range_is_enforced_on_every_plugin():
                             plugin(**{option: value})
                         count += 1
     assert count > 400
+
+
+@pytest.mark.parametrize("value", ["x", None, [1]])
+def test_an_option_of_another_kind_is_out_of_its_range(value):
+    with pytest.raises(ValueError, match=r"^angle_deg: .* is not above 0 and below 90$"):
+        registry.plugin_class("planes", "connected_components")(angle_deg=value)
