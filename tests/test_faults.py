@@ -48,7 +48,7 @@ MOTION = {"pan": Motion.pan, "still": Motion.still}
 CASES = {
     "one frame dropped": Case({"drop": "20:21"}),
     "ten frames dropped": Case({"drop": "20:30"}),
-    "a hundred frames dropped": Case({"drop": "20:120"}, {"length": 160}, 30.0, lost_most=15),
+    "a hundred frames dropped": Case({"drop": "20:120"}, {"length": 160}, 30.0, lost_most=15, said="sub-map 1 is merged with 0"),
     "repeated frames": Case({"freeze": "20:30"}),
     "frames in the reverse order": Case({"reverse": "20:30"}, said="frame 21: its time is 33 ms before that of the frame before it; it is skipped"),
     "a clock set back": Case({"jump": 30, "jump_s": -10.0}, said="frame 30: the clock was set back by 9.967 s; time goes on from the frame before"),

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import trihedron as th
-from trihedron.plugins.shared.edge_width import SHARP_PX, motion_blur_px
+from trihedron.plugins.shared.edge_width import MEDIAN_OF_NARROW, SHARP_PX, motion_blur_px
 from trihedron.plugins.shared.edge_width_kernels import edge_widths
 
 
@@ -20,17 +20,24 @@ def boxes(blur_x=0.0, blur_y=0.0):
 
 @pytest.mark.parametrize("sigma", [1.5, 2.0, 3.0])
 def test_blur_is_that_of_the_edges_beyond_sharp_ones(sigma):
-    excess = np.sqrt(sigma**2 - SHARP_PX**2)
+    excess = np.sqrt((MEDIAN_OF_NARROW * sigma) ** 2 - SHARP_PX**2)  # all edges are alike here, the narrow ones too
     assert motion_blur_px(boxes(sigma, sigma)) == pytest.approx(excess, rel=0.12)
     along_x = motion_blur_px(boxes(sigma, 0.0))  # the other axis is sharp
     assert along_x == pytest.approx(excess / np.sqrt(2.0), rel=0.12) == motion_blur_px(boxes(0.0, sigma))
 
 
 def test_a_sharp_image_and_one_without_edges_have_none():
-    assert motion_blur_px(boxes()) == motion_blur_px(boxes(1.0, 1.0)) == 0.0
+    assert motion_blur_px(boxes()) == motion_blur_px(boxes(0.8, 0.8)) == 0.0
     assert motion_blur_px(np.full((480, 640), 90, np.uint8)) == motion_blur_px(np.zeros((0, 0), np.uint8)) == 0.0
     noise = np.random.default_rng(0).integers(80, 100, (480, 640)).astype(np.uint8)
     assert motion_blur_px(cv2.GaussianBlur(noise, (0, 0), 5.0)) == 0.0  # no edge of 40 grey levels
+
+
+def test_a_surface_whose_texture_is_smooth_is_no_blur():
+    """Two thirds of the edges are wide and the others sharp; then all of it is blurred."""
+    image = boxes()
+    image[160:] = boxes(3.0, 3.0)[160:]
+    assert motion_blur_px(image) == 0.0 < motion_blur_px(boxes(3.0, 3.0)) and motion_blur_px(cv2.GaussianBlur(image, (0, 0), 2.0)) > 1.5
 
 
 @pytest.mark.parametrize("plugin", ["orb", "sift", "akaze", "opencv_orb"])
