@@ -130,8 +130,8 @@ class Alternatives:
     def _compute(self, folders: Sequence[Path], on_frame: Frames) -> None:
         began, truth = time.perf_counter(), attached_truth(self.recording.attachments, str(self.recording.path))
         with ExitStack() as stack:
-            for alternative, runner, folder in zip(self.alternatives, self.runners, folders):
-                stack.enter_context(claim_folder(folder, alternative.config, runner.computed))
+            claims = zip(folders, self.alternatives, self.runners)
+            earlier = [stack.enter_context(claim_folder(folder, one.config, runner.computed)) for folder, one, runner in claims]
             writers = [self._open_recording(alternative, folder) for alternative, folder in zip(self.alternatives, folders)]
             cpu_began = time.process_time()
             together = SideBySide(self.runners, self.threads)
@@ -148,9 +148,9 @@ class Alternatives:
                 failures = [failure for writer in writers if (failure := close_writer(writer)) is not None]
             if failures:
                 raise failures[0]
-            for outcome, runner, folder in zip(self.outcomes, self.runners, folders):
-                outcome.metrics, outcome.timing = write_files(runner, truth, folder, began, began, plot=False)
-                write_models(folder, runner)
+            for outcome, runner, folder, replaced in zip(self.outcomes, self.runners, folders, earlier):
+                outcome.metrics, outcome.timing = write_files(runner, truth, folder, began, began, replaced, plot=False)
+                write_models(folder, runner, replaced)
             self.cpu_s = time.process_time() - cpu_began
         self._account(together)
 

@@ -86,7 +86,7 @@ def _execute(config: DictConfig, out: Path, overrides: list[str], began: float, 
     _announce(runner)
     trial = partial(Runner, graph, config.seed, config.threads, replay, frames, remembered)
     before = FolderBefore.of(out / RECORDING)
-    with claim_folder(out, config, runner.computed), _removed_without_frames(runner, before):
+    with claim_folder(out, config, runner.computed) as earlier, _removed_without_frames(runner, before):
         compile_once(runner.computed, runner.count if runner.feed is None else None)
         write_configuration(out, config, overrides)
         with Warnings() as warnings, compilation_reported():
@@ -107,11 +107,11 @@ def _execute(config: DictConfig, out: Path, overrides: list[str], began: float, 
                 with defer_interrupts():
                     if writer is not None:
                         failure = close_writer(writer)
-                        metrics, timing = write_files(runner, truth, out, started, began)
+                        metrics, timing = write_files(runner, truth, out, started, began, earlier)
                     warnings.summarise()
         if replay is not None:
             print(_replay_summary(replay, runner, timing))
-        _report(out, metrics, timing, write_models(out, runner))
+        _report(out, metrics, timing, write_models(out, runner, earlier))
     if failure is not None:
         raise failure
     return metrics
@@ -298,9 +298,10 @@ def _progress(steps: Iterator[Step]) -> Iterator[Step]:
 
 
 def write_files(
-    runner: Runner, truth: Trajectory | None, out: Path, started: float, began: float, plot: bool = True
+    runner: Runner, truth: Trajectory | None, out: Path, started: float, began: float, earlier: bool, plot: bool = True
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Write the files beside the recording; returns metrics and times. A trajectory is there only with poses, its picture if `plot` only with two."""
+    """Write the files beside the recording, in the place of an `earlier` run's where the folder is that of one; returns metrics and times. A
+    trajectory is there only with poses, its picture if `plot` only with two."""
     metrics: dict[str, Any] = {}
     timing = runner.timing.summary(runner.threads, time.perf_counter() - started, started - began)
     if runner.feed is not None:
@@ -308,7 +309,7 @@ def write_files(
     if runner.budgeted is not None:
         timing["budget"] = runner.budgeted.summary()
     try:
-        for name in RESULTS if runner.result.stamps_ns else ():  # of an earlier run
+        for name in RESULTS if earlier and runner.result.stamps_ns else ():
             (out / name).unlink(missing_ok=True)
         if "pose" in runner.computed:
             result = results.with_unpacked_poses(runner.result)
@@ -333,9 +334,10 @@ def _attachments(graph: Graph, replay: Replay | None) -> dict[str, str]:
     return {TRUTH: format_trajectory(truth)} if truth is not None else {}
 
 
-def write_models(out: Path, runner: Runner) -> list[str]:
-    """Write the files of a run's folds (surface, building) in the place of an earlier run's, and return lines that describe them."""
-    removed = remove_models(out, OWN_FILES)
+def write_models(out: Path, runner: Runner, earlier: bool) -> list[str]:
+    """Write the files of a run's folds (surface, building), in the place of an `earlier` run's where the folder is that of one, and return lines that
+    describe them."""
+    removed = remove_models(out, OWN_FILES) if earlier else set()
     lines = [line for slot, value in runner.result.folds.items() for line in write_files_of(slot, out, value)]
     stale = ", ".join(sorted(name for name in removed if not (out / name).exists()))
     return [*lines, *([f"removed, as it was of an earlier run: {stale}"] if stale else [])]

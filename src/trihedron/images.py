@@ -66,12 +66,13 @@ class Frames:
 
 
 def _cure_of_shape(name: str, shape: tuple[int, ...], expected: tuple[int, ...]) -> str:
-    size, first = expected[:2], shape[-2:]
+    """Return the cure of an array that has other channels, or in another place, than the camera's images (h, w) or (h, w, 3)."""
+    size = expected[:2]
     if shape[:2] == size and len(shape) == 3 and shape[2] > (channels := 3 if len(expected) == 3 else 1):
         return f"give {name}[:, :, :3]" if channels == 3 else f"give one channel: {name}[:, :, 0]"
     if shape == (*size, 1):
         return f"give {name}[:, :, 0]" if len(expected) == 2 else f"give np.repeat({name}, 3, axis=2)"
-    if len(shape) == 3 and first == size:
+    if len(shape) == 3 and shape[1:] == size:
         return f"give the channels last: {name}.transpose(1, 2, 0)" if len(expected) == 3 else f"give {name}[0]"
     return "give images of the camera's size"
 

@@ -127,6 +127,7 @@ class Slam:
         self._plan: tuple[int, Building | None] = 0, None  # the last one returned, and the time of the last frame then
         self._failure: BaseException | None = None
         self._ended = self._closed = False
+        self._earlier = False  # whether `out` is the folder of an earlier run
         self._topics = recorded_topics(self._config, graph, None)
         self._memory = MemorySink(max(history, 1) if out is None else 1, {"dataset", EFFORT_TOPIC} | self._topics)
         self._stack = ExitStack()
@@ -152,7 +153,7 @@ class Slam:
         """Open the run folder and its recording, then compile and load what the first frames need."""
         if self._out is not None:
             self._config.out = str(self._out)
-            self._stack.enter_context(claim_folder(self._out, self._config, self._runner.computed))
+            self._earlier = self._stack.enter_context(claim_folder(self._out, self._config, self._runner.computed))
             write_configuration(self._out, self._config, self._words)
         compile_once(self._runner.computed, None)
         with compilation_reported():
@@ -358,8 +359,8 @@ class Slam:
         self._thread.join()
         with self._stack:
             if self._out is not None and self._last >= 0:
-                write_files(self._runner, None, self._out, self._started, self._began)
-                write_models(self._out, self._runner)
+                write_files(self._runner, None, self._out, self._started, self._began, self._earlier)
+                write_models(self._out, self._runner, self._earlier)
         if self._failure is not None:
             raise self._failure
 

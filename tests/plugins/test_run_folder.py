@@ -47,6 +47,7 @@ def test_a_run_does_not_lose_corrections_by_hand(tmp_path, capsys):
 def test_a_run_removes_what_an_earlier_one_left(tmp_path, capsys):
     out = tmp_path / "run"
     out.mkdir()
+    (out / ".hydra").mkdir()
     write_building(out, two_rooms())
     for name in ("floorplan.pdf", "surface.ply", "surface.json", "trajectory.png", "metrics.json", "mine.txt"):
         (out / name).write_text("older")
@@ -55,6 +56,13 @@ def test_a_run_removes_what_an_earlier_one_left(tmp_path, capsys):
     names = "building.glb, building.json, floorplan.dxf, floorplan.pdf, floorplan.svg, surface.json, surface.ply"
     assert f"removed, as it was of an earlier run: {names}\n" in printed and f"{out}/metrics.json" not in printed
     assert {path.name for path in out.iterdir()} == {".hydra", "run.mcap", "timing.json", "mine.txt"}
+
+
+def test_a_run_leaves_files_that_are_no_run_s(tmp_path):
+    """The folder of a data set may have a mesh of its own."""
+    (tmp_path / "surface.ply").write_text("of somebody")
+    assert main(["run", *SMALL, "dataset.length=1", "outputs=[keypoints]", f"out={tmp_path}"]) == 0
+    assert (tmp_path / "surface.ply").read_text() == "of somebody"
 
 
 @pytest.mark.parametrize("reads", ["replay={}", "replay={}/run.mcap", "dataset=mcap dataset.path={}"])
