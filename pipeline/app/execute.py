@@ -20,7 +20,7 @@ from tqdm import tqdm
 
 from trihedron.pipeline.app.budgets import budget_of
 from trihedron.pipeline.app.compilation import compile_once
-from trihedron.pipeline.app.trajectory_plot import PLOT, trajectory_figure
+from trihedron.pipeline.app.trajectory_plot import trajectory_figure
 from trihedron.pipeline.app.viewers import Viewer, opened_viewer
 from trihedron.pipeline.core.config import Feedback, graph_of
 from trihedron.pipeline.core.errors import ConfigError, DataError, LibraryError, RecordingError, StageError, did_you_mean, printable
@@ -51,8 +51,6 @@ from trihedron.pipeline.run.warm_up import compilation_reported, warm_up_budgete
 
 NETWORKS = tuple(f"{slot}.model" for slot in SLOTS)  # files of networks, of the plugins that run one
 READ_PATHS = ("dataset.path", "dataset.camera", "dataset.options.path", "dataset.options.camera", "load_map", "building.edits", *NETWORKS)
-RESULTS = (results.TRAJECTORY, results.CAUSAL, results.METRICS, PLOT)  # of the poses, where there are some
-OWN_FILES = (*RESULTS, results.TIMING, RECORDING)
 PLAIN_PROGRESS_SECONDS = 5.0
 MAX_THREADS = 256
 
@@ -309,7 +307,7 @@ def write_files(
     if runner.budgeted is not None:
         timing["budget"] = runner.budgeted.summary()
     try:
-        for name in RESULTS if earlier and runner.result.stamps_ns else ():
+        for name in results.OF_POSES if earlier and runner.result.stamps_ns else ():
             (out / name).unlink(missing_ok=True)
         if "pose" in runner.computed:
             result = results.with_unpacked_poses(runner.result)
@@ -317,9 +315,9 @@ def write_files(
             metrics = results.write_results(out, result, final, truth)
             if plot and len(final) > 1:
                 try:
-                    trajectory_figure(final, truth, out / PLOT, [(pose.stamp_ns, pose.status) for pose in result.poses])
+                    trajectory_figure(final, truth, out / results.PLOT, [(pose.stamp_ns, pose.status) for pose in result.poses])
                 except LibraryError as error:
-                    print(f"trihedron: warning: {PLOT} is not drawn: {error}", file=sys.stderr)
+                    print(f"trihedron: warning: {results.PLOT} is not drawn: {error}", file=sys.stderr)
         results.write_json(out / results.TIMING, timing)
     except OSError as error:
         raise DataError(str(error.filename or out), f"cannot be written: {error.strerror}", "make room, or give another out=FOLDER") from error
@@ -337,7 +335,7 @@ def _attachments(graph: Graph, replay: Replay | None) -> dict[str, str]:
 def write_models(out: Path, runner: Runner, earlier: bool) -> list[str]:
     """Write the files of a run's folds (surface, building), in the place of an `earlier` run's where the folder is that of one, and return lines that
     describe them."""
-    removed = remove_models(out, OWN_FILES) if earlier else set()
+    removed = remove_models(out) if earlier else set()
     lines = [line for slot, value in runner.result.folds.items() for line in write_files_of(slot, out, value)]
     stale = ", ".join(sorted(name for name in removed if not (out / name).exists()))
     return [*lines, *([f"removed, as it was of an earlier run: {stale}"] if stale else [])]

@@ -17,7 +17,6 @@ from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import DEGRADED, F64, LOST, Trajectory
 from trihedron.pipeline.run.metrics import FEWEST_POSES, associate, rotation_angles_deg
 
-PLOT = "trajectory.png"
 AXES = "xyz"
 MARGINS = {"left": 0.07, "right": 0.98, "bottom": 0.07, "top": 0.93, "wspace": 0.22, "hspace": 0.25}  # to compute them is to draw everything twice
 ESTIMATE_COLOR, TRUTH_COLOR = "tab:blue", "tab:green"

@@ -23,6 +23,8 @@ from trihedron.pipeline.run.stated_sigma import stated_sigma
 from trihedron.pipeline.run.status_check import without_figures
 
 TRAJECTORY, CAUSAL, TIMING, METRICS = "trajectory.txt", "trajectory_causal.txt", "timing.json", "metrics.json"
+PLOT = "trajectory.png"
+OF_POSES = (TRAJECTORY, CAUSAL, METRICS, PLOT)  # where there are some
 
 
 def causal_trajectory(result: Result) -> Trajectory:

@@ -19,9 +19,11 @@ from trihedron.pipeline.core.errors import ConfigError, DataError
 from trihedron.pipeline.core.files import make_folder, write_file
 from trihedron.pipeline.core.registry import files_of_folds
 from trihedron.pipeline.record.mcap_file import RECORDING, recording_file
+from trihedron.pipeline.run.results import OF_POSES, TIMING
 
 CONFIG = ".hydra"  # folder of the composed configuration and the words it was composed of
 CURE = "give another out=FOLDER"
+OWN_FILES = {*OF_POSES, TIMING, RECORDING}  # of a run itself
 
 
 @dataclass(frozen=True)
@@ -69,10 +71,9 @@ def claim_folder(folder: Path, config: DictConfig, computed: Collection[str]) ->
     that of an earlier run. Raises TrihedronError, before anything is written, where results would be replaced that the run reads, or that a user
     corrected by hand."""
     _check_sources(folder / RECORDING, config)
-    if folder.is_dir() and any(folder.iterdir()):
-        for slot, files in files_of_folds().items():
-            if files.check is not None:
-                files.check(folder, config.get(slot) if slot in computed else None)
+    for slot, files in files_of_folds().items() if _other_files(folder) else ():
+        if files.check is not None:
+            files.check(folder, config.get(slot) if slot in computed else None)
     earlier = (folder / CONFIG).is_dir()
     with lock_folder(folder):
         yield earlier
@@ -88,11 +89,17 @@ def _check_sources(recording: Path, config: DictConfig) -> None:
                 raise ConfigError("out", f"{recording} would be replaced, which {key} reads", CURE)
 
 
-def remove_models(folder: Path, kept: Collection[str]) -> set[str]:
+def _other_files(folder: Path) -> set[str]:
+    """Return the names of the files in a folder, which need not exist, beside those of every run. Only for these an owner is asked, which takes an
+    import of all plugins."""
+    return {path.name for path in (folder.iterdir() if folder.is_dir() else ()) if path.is_file()} - OWN_FILES
+
+
+def remove_models(folder: Path) -> set[str]:
     """Remove the files of models that an earlier run, or a command on it, left in a folder, and return their names: beside the recording of another
-    run they would be taken for its own. `kept` are the names of the run's other files."""
-    others = {path.name for path in folder.iterdir() if path.is_file()} - set(kept)
-    models = {name for files in files_of_folds().values() for name in files.names} & others if others else set()  # which imports all plugins
+    run they would be taken for its own."""
+    others = _other_files(folder)
+    models = {name for files in files_of_folds().values() for name in files.names} & others if others else set()
     for name in models:
         (folder / name).unlink()
     return models

@@ -30,7 +30,7 @@ from trihedron.plugins.mapping.merge_verification import propose_merge
 from trihedron.plugins.mapping.merging import merge_lines, merge_planes, merge_points
 from trihedron.plugins.mapping.projection import visible_planes
 from trihedron.plugins.mapping.reference_keyframe import submap_of, transform_to_map
-from trihedron.plugins.mapping.submaps import is_elsewhere, merge_submaps, part_submap
+from trihedron.plugins.mapping.submaps import is_elsewhere, merge_submaps, split_submap
 from trihedron.plugins.none import NoMap
 
 log = logging.getLogger("trihedron")
@@ -79,8 +79,8 @@ class Covisibility(KeyframeOptions):
             corrected = replace(apply_correction(corrected, loop), loop_closed=corrected.revision + 1)
         if corrected is not None and relocalise is not None and relocalise.status == DEGRADED and pose.status != LOST:
             corrected = self._merge(corrected, transform_to_map(pose, corrected), transform_to_map(relocalise, corrected))
-        if corrected is not None and is_elsewhere(pose) and pose.submap == submap_of(pose, corrected):  # else it is parted already
-            corrected = self._part(corrected, pose)
+        if corrected is not None and is_elsewhere(pose) and pose.submap == submap_of(pose, corrected):  # else it is split already
+            corrected = self._split(corrected, pose)
         pose = replace(transform_to_map(pose, corrected), submap=submap_of(pose, corrected))
         if corrected is None:
             matches = None
@@ -108,12 +108,14 @@ class Covisibility(KeyframeOptions):
             log.warning("map: sub-map %d is merged with %d at frame %d; map.apart=[%d] undoes it", number, recognised.submap, pose.index, number)
         return replace(merge_submaps(map, pose, recognised, self.merge_deg, self.merge_m), loop_closed=map.revision + 1)
 
-    def _part(self, map: Map, pose: Pose) -> Map:
-        """The map from which what was mapped since the camera was lost is parted."""
-        map = replace(part_submap(map, pose), loop_closed=map.revision + 1)
-        number, begun = submap_of(pose, map), pose.lost_from
+    def _split(self, map: Map, pose: Pose) -> Map:
+        """The map that what was mapped since the camera was lost is split off."""
+        split = split_submap(map, pose)
+        if split is map:
+            return map
+        number, begun = submap_of(pose, split), pose.lost_from
         log.warning("map: the camera that was lost in frame %d was found in another place; what it mapped since is sub-map %d", begun, number)
-        return map
+        return replace(split, loop_closed=map.revision + 1)
 
     def _version(self, map: Map, frame: Frame) -> Map:
         return replace(map, index=frame.index, stamp_ns=frame.stamp_ns, revision=map.revision + 1)

@@ -20,7 +20,7 @@ from trihedron.plugins.mapping.covisibility_graph import (
 )
 from trihedron.plugins.mapping.landmark_kernels import count_redundant
 from trihedron.plugins.mapping.landmark_kinds import LINE, PLANE, POINT, LandmarkKind, landmarks_of, observations_of, with_tables
-from trihedron.plugins.mapping.landmarks import isin, remove_rows, union
+from trihedron.plugins.mapping.landmarks import isin, newest_first, remove_rows, union
 
 RETAINED = 4  # newest keyframes that are never redundant yet: the newest one's landmarks are still on trial
 
@@ -110,7 +110,7 @@ def remove_keyframe(map: Map, keyframe: int) -> Map:
     for kind, table in tables.items():
         ids = observed_by(map, row, kind)
         observers = table.rows("observers", ids)
-        observers = -np.sort(-np.where(observers == keyframe, -1, observers), axis=1)  # newest first, as before
+        observers = newest_first(np.where(observers == keyframe, -1, observers))
         table = table.updated(ids, observers=observers)
         tables[kind] = remove_rows(table, ids[observers[:, 0] < 0]) if kind != PLANE else table
     nothing = {kind.span_column: np.zeros((1, 2), np.int32) for kind in tables}

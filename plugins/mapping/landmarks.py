@@ -107,6 +107,11 @@ def remove_rows(table: Table, ids: I32) -> Table:
     return table.updated(ids, alive=np.zeros(len(ids), np.bool_))
 
 
+def newest_first(observers: I32) -> I32:
+    """Return the observers (n, k) of landmarks in their order, the newest keyframe first, empty places (-1) last."""
+    return np.asarray(-np.sort(-observers, axis=1))
+
+
 # Sets of ids, as sorted rows. Ids lie close together, so marking them beats sorting them.
 
 

@@ -14,7 +14,7 @@ from trihedron.plugins.mapping.covisibility_graph import newest_keyframes, obser
 from trihedron.plugins.mapping.insertion import Observations, extend_lines
 from trihedron.plugins.mapping.landmark_kernels import farthest_samples
 from trihedron.plugins.mapping.landmark_kinds import LINE, PLANE, POINT, LandmarkKind, landmarks_of, observations_of, observed_rows, with_tables
-from trihedron.plugins.mapping.landmarks import OBSERVERS, isin, remove_rows
+from trihedron.plugins.mapping.landmarks import OBSERVERS, isin, newest_first, remove_rows
 from trihedron.plugins.mapping.plane_fusion import fit_planes, project_to_planes
 from trihedron.plugins.mapping.projection import clip_segments, parameters_on, points_along
 from trihedron.plugins.shared.feature_matching import match_lines, match_near
@@ -149,11 +149,10 @@ def _remove_merged(map: Map, kind: LandmarkKind, kept: I32, gone: I32) -> Map:
     """Remove the landmarks `gone`; their observers, counts and observations pass to the distinct ids `kept`."""
     table = landmarks_of(map)[kind]
     mine, theirs = (table.columns_at(ids, "observers", "found", "visible") for ids in (kept, gone))
-    both = np.concatenate([mine[0], theirs[0]], axis=1)
-    both = -np.sort(-both, axis=1)
+    both = newest_first(np.concatenate([mine[0], theirs[0]], axis=1))
     both[:, 1:][both[:, 1:] == both[:, :-1]] = -1  # observed by the same keyframe
     table = table.updated(
-        kept, observers=-np.sort(-both, axis=1)[:, :OBSERVERS], found=np.maximum(mine[1], theirs[1]), visible=np.maximum(mine[2], theirs[2])
+        kept, observers=newest_first(both)[:, :OBSERVERS], found=np.maximum(mine[1], theirs[1]), visible=np.maximum(mine[2], theirs[2])
     )
     return with_tables(map, {kind: remove_rows(table, gone)}, {kind: _replace_ids(map, kind, kept, gone)})
 

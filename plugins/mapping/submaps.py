@@ -1,6 +1,6 @@
 """Sub-maps: parts of the map in separate worlds, made while the camera was lost, and their rigid merging once a place is recognised.
 
-A camera that was lost may be found again where it is not: in a room that looks like the one it was lost in. What it maps from then on is parted from
+A camera that was lost may be found again where it is not: in a room that looks like the one it was lost in. What it maps from then on is split off
 the map once it misses what the map holds there."""
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from trihedron.pipeline.core.types import F64, I32, Map, Pose, Table
 from trihedron.plugins.mapping.correction import transform_landmarks
 from trihedron.plugins.mapping.covisibility_graph import keyframes_of
 from trihedron.plugins.mapping.landmark_kinds import KINDS, LandmarkKind, landmarks_of, observations_of, observed_rows, with_tables
-from trihedron.plugins.mapping.landmarks import distinct, index_of, isin
+from trihedron.plugins.mapping.landmarks import distinct, index_of, isin, newest_first
 from trihedron.plugins.mapping.merging import fuse_planes
 from trihedron.plugins.mapping.reference_keyframe import submap_of
 
@@ -45,19 +45,21 @@ def is_elsewhere(pose: Pose) -> bool:
     return pose.missing > MOST_MISSING
 
 
-def part_submap(map: Map, pose: Pose) -> Map:
-    """Part what was mapped since the camera was lost from the rest of the map, as a sub-map of its own, whose world has the poses that it had.
-    Landmarks that both observed are two from then on."""
+def split_submap(map: Map, pose: Pose) -> Map:
+    """Split what was mapped since the camera was lost off the rest of the map, as a sub-map of its own, whose world has the poses that it had.
+    Landmarks that both observed are two from then on. The same map where the pose is relative to an older keyframe, and would not go with it."""
     submaps, index = map.keyframes.column("submap"), map.keyframes.column("index")
     rows = np.flatnonzero((submaps == submap_of(pose, map)) & (index >= pose.lost_from)).astype(np.int32)
+    if pose.reference not in rows:
+        return map
     keyframes = map.keyframes.updated(rows, submap=np.full(len(rows), submaps.max() + 1, np.int32))
     tables, observations = landmarks_of(map), observations_of(map)
     for kind in KINDS:
-        tables[kind], observations[kind] = _parted(map, rows, kind)
+        tables[kind], observations[kind] = _split(map, rows, kind)
     return with_tables(replace(map, keyframes=keyframes), tables, observations)
 
 
-def _parted(map: Map, keyframes: I32, kind: LandmarkKind) -> tuple[Table, Table]:
+def _split(map: Map, keyframes: I32, kind: LandmarkKind) -> tuple[Table, Table]:
     """The landmarks of a kind and their observations, with a copy of each that some of the keyframes and others observed, for the former."""
     table, observations = landmarks_of(map)[kind], observations_of(map)[kind]
     rows, ids, counts = observed_rows(map, keyframes, kind)
@@ -70,13 +72,9 @@ def _parted(map: Map, keyframes: I32, kind: LandmarkKind) -> tuple[Table, Table]
     known = table.rows("observers", shared)
     mine = np.isin(known, keyframes)
     columns = dict(zip(table.schema, table.columns_at(shared, *table.schema)))
-    columns |= {"first": first, "observers": _newest_first(np.where(mine, known, -1))}
-    table, copies = table.updated(shared, observers=_newest_first(np.where(mine, -1, known))).appended(**columns)
+    columns |= {"first": first, "observers": newest_first(np.where(mine, known, -1))}
+    table, copies = table.updated(shared, observers=newest_first(np.where(mine, -1, known))).appended(**columns)
     return table, observations.updated(rows, **{kind.id_column: copies[number]})
-
-
-def _newest_first(observers: I32) -> I32:
-    return np.asarray(-np.sort(-observers, axis=1))
 
 
 def _world_covariance(map: Map, rows: I32, recognised: Pose) -> F64:

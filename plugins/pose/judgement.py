@@ -137,7 +137,7 @@ def since_loss(pose: Pose, previous: Pose) -> Pose:
 
 def missing_points(previous: Pose, submap: int, problem: MapAlignment, T_world_camera: F64) -> float:
     """Return the moving average of the share of points mapped before the latest loss that should be matched and are not: the surface that they lie on
-    is observed, from about where they were mapped. It begins anew where the sub-map of the camera was merged or parted since the previous pose."""
+    is observed, from about where they were mapped. It begins anew where the sub-map of the camera was merged or split since the previous pose."""
     map, visible = problem.map, problem.matches.visible_points
     if not previous.lost_from or submap != previous.submap:
         return 0.0
@@ -152,9 +152,8 @@ def missing_points(previous: Pose, submap: int, problem: MapAlignment, T_world_c
 def _is_observed(problem: MapAlignment, points: I32, T_world_camera: F64) -> NDArray[np.bool_]:
     """Return (n,) True for points of the map that lie on the plane that is observed there, and that the camera sees as their first keyframe did."""
     map, camera = problem.map, problem.camera
-    positions = map.points.rows("position_m", points)
-    local = transform(invert(T_world_camera), positions)
-    first = map.keyframes.rows("T_world_camera", map.points.rows("first", points))[:, :3, 3]
+    positions, first = map.points.columns_at(points, "position_m", "first")
+    local, first = transform(invert(T_world_camera), positions), map.keyframes.rows("T_world_camera", first)[:, :3, 3]
     rays, before = positions - T_world_camera[:3, 3], positions - first
     distance, distance_before = np.linalg.norm(rays, axis=1), np.linalg.norm(before, axis=1)
     alike = (rays * before).sum(axis=1) > SAME_VIEW * distance * distance_before

@@ -67,13 +67,13 @@ class Frames:
 
 def _cure_of_shape(name: str, shape: tuple[int, ...], expected: tuple[int, ...]) -> str:
     """Return the cure of an array that has other channels, or in another place, than the camera's images (h, w) or (h, w, 3)."""
-    size = expected[:2]
-    if shape[:2] == size and len(shape) == 3 and shape[2] > (channels := 3 if len(expected) == 3 else 1):
-        return f"give {name}[:, :, :3]" if channels == 3 else f"give one channel: {name}[:, :, 0]"
+    size, color = expected[:2], len(expected) == 3
     if shape == (*size, 1):
-        return f"give {name}[:, :, 0]" if len(expected) == 2 else f"give np.repeat({name}, 3, axis=2)"
+        return f"give np.repeat({name}, 3, axis=2)" if color else f"give {name}[:, :, 0]"
+    if len(shape) == 3 and shape[:2] == size and shape[2] > (3 if color else 1):
+        return f"give {name}[:, :, :3]" if color else f"give one channel: {name}[:, :, 0]"
     if len(shape) == 3 and shape[1:] == size:
-        return f"give the channels last: {name}.transpose(1, 2, 0)" if len(expected) == 3 else f"give {name}[0]"
+        return f"give the channels last: {name}.transpose(1, 2, 0)" if color else f"give {name}[0]"
     return "give images of the camera's size"
 
 

@@ -15,12 +15,13 @@ from trihedron.pipeline.run.poses import Poses
 from trihedron.pipeline.run.results import final_trajectory, is_merged
 from trihedron.plugins.map.covisibility import Covisibility
 from trihedron.plugins.mapping.covisibility_graph import current_submap, local_window, newest_keyframes
+from trihedron.plugins.mapping.submaps import split_submap
 from trihedron.plugins.matches.local_map import LocalMap
 from trihedron.plugins.pose.refine import Refine
 
 sys.path.insert(0, str(Path(__file__).parent))
 from landmark_world import World, camera_at, rotation_of, translation_of
-from map_steps import correction
+from map_steps import correction, walk
 
 EVERY = Covisibility(min_frames=1, max_frames=1, min_shift=1e-6, min_turn_deg=1e-6, verified_by=1)
 AWAY = exp_se3(np.array([3.0, -1.0, 0.5, 0.1, 1.2, -0.3]))  # from the world to that of the sub-map
@@ -149,3 +150,21 @@ def test_a_new_sub_map_begins_after_as_many_frames_as_were_sought_in_vain():
     assert statuses == [("lost", 0)] * 16 + [("degraded", 1)]
     assert pose.reason == "first frame of sub-map 1: relocalisation failed for 15 frames" and pose.reference == -1
     assert np.linalg.eigvalsh(pose.covariance).max() < 1e-9
+
+
+def test_what_was_mapped_since_a_loss_is_split_off_with_landmarks_of_its_own():
+    """Six keyframes of one walk, as if the camera had been lost after the first three: what both halves observed are two landmarks from then on."""
+    map = walk(World(1500), 6, stride=4)
+    middle = int(map.keyframes.row("index", 3))
+    pose = pose_of(camera_at(0), 0, lost_from=middle, missing=0.97, reference=len(map.keyframes) - 1)
+    split = split_submap(map, pose)
+    assert split.keyframes.column("submap").tolist() == [0, 0, 0, 1, 1, 1]
+    assert len(split.points) > len(map.points) and len(split.planes) > len(map.planes)
+    for table in (split.points, split.lines, split.planes):
+        first, observers = (table.column(name)[table.column("alive")] for name in ("first", "observers"))
+        late = first[:, None] >= 3
+        assert ((observers < 0) | ((observers >= 3) == late)).all() and (late & (observers >= 3)).any()
+    for submap in (0, 1):
+        seen_by = local_window(split, camera_at(0), 2, 10, 3, submap=submap).points
+        assert len(seen_by) and ((split.points.rows("first", seen_by) >= 3) == bool(submap)).all()
+    assert split_submap(map, dataclasses.replace(pose, reference=0)) is map  # relative to a keyframe of the rest
