@@ -58,7 +58,7 @@ def slam(camera):
 
 
 def test_the_covariance_of_a_camera_that_is_known_exactly_has_no_share_of_its_calibration(folder, camera):
-    exact = th.CalibrationSigmas(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    exact = th.CalibrationSigmas(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     poses = []
     for one in (camera, replace(camera, sigmas=exact)):
         with th.Slam(one) as made:

@@ -324,7 +324,8 @@ class Pose(Value):
 
     Five fields are what the pose's error owes to an imperfect calibration (`plugins.shared.calibration_error`, which defines the parameters and their
     units): `sensitivity` is the derivative of the error by them, `calibration_information` and `calibration_score` the information of the residuals
-    on them so far. `twist` is the camera's velocity (m/s, rad/s) in its own frame, `reference_twist` that of the reference keyframe."""
+    on them so far. `twist` is the camera's velocity (m/s, rad/s) in its own frame, `reference_twist` that of the reference keyframe.
+    `depth_scale_sigma` is the relative standard deviation of the scale of all depths, of which residuals tell nothing."""
 
     version: ClassVar[int] = 5
 
@@ -352,6 +353,7 @@ class Pose(Value):
     keyframe_covariance: Annotated[F64, Shape(6, 6), Finite()] = field(default_factory=lambda: np.zeros((6, 6)))
     lost_from: Annotated[int, Within(0, 2**31)] = 0
     missing: Annotated[float, Within(0.0, 1.0)] = 0.0
+    depth_scale_sigma: Annotated[float, Within(0.0, 1.0)] = 0.0
 
     @property
     def local_covariance(self) -> F64:
@@ -432,6 +434,7 @@ class CalibrationSigmas:
     readout_s: Annotated[float, Within(0.0, 1.0)] = 0.02  # of colour, first row to last
     delay_s: Annotated[float, Within(0.0, 1.0)] = 0.012  # of depth relative to colour
     depth_readout_s: Annotated[float, Within(0.0, 1.0)] = 0.015
+    depth_scale: Annotated[float, Within(0.0, 1.0)] = 0.005  # of all depths alike, relative
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from trihedron.pipeline.core.types import DEGRADED, LOST, OK, Pose
 class Poses(Sequence[Pose]):
     """A sequence of poses in frame order, stored as numbers: the rows of rigid motions and the upper triangles of covariances."""
 
-    _REALS, _WHOLE = 12 + 12 + 21 + 21 + 1, 12  # numbers a pose
+    _REALS, _WHOLE = 12 + 12 + 21 + 21 + 2, 12  # numbers a pose
     _STATUSES = (OK, DEGRADED, LOST)
     _UPPER = np.triu_indices(6)
     _LAST_ROW = np.array([0.0, 0.0, 0.0, 1.0])
@@ -28,7 +28,7 @@ class Poses(Sequence[Pose]):
         """Append one pose."""
         for numbers in (pose.T_world_camera[:3], pose.T_reference_camera[:3], pose.covariance[self._UPPER], pose.map_covariance[self._UPPER]):
             self._reals.frombytes(numbers.tobytes())
-        self._reals.append(pose.noise_scale)
+        self._reals.extend((pose.noise_scale, pose.depth_scale_sigma))
         self._reasons += pose.reason.encode()
         counts = pose.inliers.tolist()
         self._whole.extend((pose.index, pose.stamp_ns, pose.reference, *counts, pose.unobservable, pose.submap, pose.unrecognised, pose.repeats))
@@ -58,4 +58,4 @@ class Poses(Sequence[Pose]):
         counts, reason = np.array(inliers, np.int32), self._reasons[self._whole[k * self._WHOLE - 1] if k else 0 : end].decode()
         status = self._STATUSES[state]
         first, second = (index, stamp_ns, T, covariances[0], T_reference, reference), (counts, unobservable, status, reason, submap, unrecognised)
-        return Pose(*first, *second, covariances[1], float(reals[66]), repeats)
+        return Pose(*first, *second, covariances[1], float(reals[66]), repeats, depth_scale_sigma=float(reals[67]))

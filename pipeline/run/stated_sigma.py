@@ -16,9 +16,10 @@ from trihedron.pipeline.core.registry import covariance_due_to
 from trihedron.pipeline.core.types import DEGRADED, OK, Pose
 from trihedron.pipeline.run.consistency import judged_poses
 
-NOISE, DRIFT, CALIBRATED = "noise", "drift", "calibration"
-CAUSES = {NOISE: "noise of the measurements", DRIFT: "drift of the map", CALIBRATED: "the calibration"}
+NOISE, DRIFT, CALIBRATED, SCALED = "noise", "drift", "calibration", "depth_scale"
+CAUSES = {NOISE: "noise of the measurements", DRIFT: "drift of the map", CALIBRATED: "the calibration", SCALED: "the scale of depth"}
 SEE_MORE = "turn slower, or give more light"
+MEASURE = "measure a length in the room, and state sigmas.depth_scale in camera.yaml"
 FEW = 0.5  # of the median number of features of the frames that are ok, below which a frame shows few
 
 
@@ -27,8 +28,8 @@ class StatedSigma:
     """σ of the `ok` poses without the first, which is exact by definition.
 
     `share` is the part, of 1, that each of CAUSES has in the variance of their positions: noise of the measurements, drift of the keyframes, an
-    imperfect calibration; empty where poses state one covariance alone. `few_features` counts the degraded frames that show less than FEW of the
-    usual features of the map."""
+    imperfect calibration, the scale of all depths; empty where poses state one covariance alone. `few_features` counts the degraded frames that show
+    less than FEW of the usual features of the map."""
 
     poses: int
     median_m: float
@@ -67,7 +68,7 @@ def stated_sigma(poses: Sequence[Pose], calibration_m2: Sequence[float]) -> Stat
 
 def calibration_variance_m2(pose: Pose) -> float:
     """Return what the variance of a pose's position owes to the calibration."""
-    return _variance_m2(covariance_due_to(CALIBRATED, pose)) if pose.sensitivity.any() else 0.0
+    return _variance_m2(covariance_due_to(CALIBRATED, pose)) if pose.sensitivity.any() or pose.depth_scale_sigma else 0.0
 
 
 def _variance_m2(covariance: Any) -> float:
@@ -75,11 +76,12 @@ def _variance_m2(covariance: Any) -> float:
 
 
 def _shares(poses: Sequence[Pose], calibration: float) -> dict[str, float]:
-    """Return cause -> share of the summed variance of the positions, of which the calibration has `calibration` (m²)."""
+    """Return cause -> share of the summed variance of the positions, of which the calibration and the scale of depth have `calibration` (m²)."""
     whole, of_map = (sum(_variance_m2(getattr(pose, name)) for pose in poses) for name in ("covariance", "map_covariance"))
+    scaled = sum(float(np.sum((pose.depth_scale_sigma * pose.T_world_camera[:3, 3]) ** 2)) for pose in poses)
     if not (whole > 0.0 and of_map > 0.0):
         return {}
-    parts = {NOISE: whole - of_map, DRIFT: of_map - calibration, CALIBRATED: calibration}
+    parts = {NOISE: whole - of_map, DRIFT: of_map - calibration, CALIBRATED: calibration - scaled, SCALED: scaled}
     return {cause: part / whole for cause, part in parts.items()}
 
 
@@ -91,7 +93,7 @@ def dominant_cause(sigma: Mapping[str, Any]) -> str:
 
 def sigma_line(sigma: Mapping[str, Any], folder: Path) -> str:
     """Return the line of a run that ends, of `StatedSigma.to_dict()` and its folder: σ, what dominates it, and what would improve it."""
-    cures = {NOISE: f": {SEE_MORE}", CALIBRATED: f": trihedron calibrate {shlex.quote(str(folder))}"}
+    cures = {NOISE: f": {SEE_MORE}", CALIBRATED: f": trihedron calibrate {shlex.quote(str(folder))}", SCALED: f": {MEASURE}"}
     line = "σ of ok poses: " + ", ".join(f"{1e3 * sigma[f'{k}_m']:.1f} mm, {sigma[f'{k}_deg']:.2f}° ({k})" for k in ("median", "worst"))
     if cause := dominant_cause(sigma):
         line += f"; mostly {CAUSES[cause]}{cures.get(cause, '')}"

@@ -54,6 +54,7 @@ def with_calibration(pose: Pose, previous: Pose, solution: PoseSolution, problem
         sensitivity=matmul(to_pose, matmul(problem.information, before) - equations.C),
         calibration_information=previous.calibration_information + _symmetric(equations.G - matmul(share, equations.C)) / scale,
         calibration_score=previous.calibration_score + (equations.s - matmul(share, equations.b)) / scale,
+        depth_scale_sigma=problem.camera.sigmas.depth_scale,
     )
 
 
@@ -76,6 +77,7 @@ def carried_calibration(pose: Pose, previous: Pose) -> Pose:
         sensitivity=matmul(adjoint(matmul(invert(pose.T_world_camera), previous.T_world_camera)), previous.sensitivity),
         calibration_information=previous.calibration_information,
         calibration_score=previous.calibration_score,
+        depth_scale_sigma=previous.depth_scale_sigma,
     )
 
 

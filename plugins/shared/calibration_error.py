@@ -8,6 +8,9 @@ but counted in its covariance. Each is in units of `calibration_scales`, the sta
 4     focal length of depth relative to colour           9   readout of colour, first row to last, about the middle row
 5, 6  registration of depth to colour, x and y           10  delay of depth relative to colour
                                                          11  readout of depth
+
+The scale of all depths leaves no residual, since the world and the way through it grow alike, so that it is none of these. Its part of a pose's error
+is the position in the world times the scale's error.
 """
 
 from __future__ import annotations
@@ -41,4 +44,7 @@ def calibration_scales(camera: Camera) -> F64:
 def calibration_covariance(pose: Pose) -> F64:
     """Covariance (6, 6) of a pose's error by the calibration, part of its `map_covariance`."""
     moment = calibration_moment(pose.calibration_information, pose.calibration_score)
-    return np.asarray(matmul(pose.sensitivity, moment, pose.sensitivity.T))
+    scaled = pose.depth_scale_sigma * matmul(pose.T_world_camera[:3, :3].T, pose.T_world_camera[:3, 3])
+    by_scale = np.zeros((6, 6))
+    by_scale[:3, :3] = np.outer(scaled, scaled)
+    return np.asarray(matmul(pose.sensitivity, moment, pose.sensitivity.T) + by_scale)

@@ -331,11 +331,11 @@ def calibration_moment(information: F64, score: F64) -> F64:
     """Second moment (12, 12) of the parameters given the evidence of residuals, `information` (12, 12) and `score` (12,): the covariance, and the
     square of the mean, which nothing is corrected by.
 
-    They are independent with a common variance v, which is learned by expectation maximisation (MacKay, Neural Computation 1992) from 1, its value
-    for a camera of a kind without a prior. It falls with what residuals rule out: an exact camera ends with a smaller one."""
+    They are independent with a common variance v, which is 1 as stated, or more where expectation maximisation (MacKay, Neural Computation 1992)
+    finds that the residuals ask for it."""
     v = 1.0
     for _ in range(EXPECTATIONS + 1):
         covariance = inverse_positive(information + np.eye(CALIBRATION) / v)
         mean = matvec(covariance, score)
-        v = (PRIOR_COUNT + np.trace(covariance) + (mean * mean).sum()) / (PRIOR_COUNT + CALIBRATION)
+        v = max(1.0, (PRIOR_COUNT + np.trace(covariance) + (mean * mean).sum()) / (PRIOR_COUNT + CALIBRATION))
     return covariance + np.outer(mean, mean)

@@ -81,7 +81,7 @@ BAD = [
     (
         GOOD + "sigmas: 0.01\n",
         "{}: sigmas holds no keys; give it some of focal centre depth_focal registration inverse_depth depth_radial readout_s delay_s "
-        "depth_readout_s",
+        "depth_readout_s depth_scale",
     ),
     (GOOD + "sigmas: {focul: 0.01}\n", "{}: unknown key 'sigmas.focul'; did you mean 'focal'?"),
     (GOOD + "sigmas: {focal: wide}\n", "{}: sigmas.focal is 'wide'; give a finite number"),

@@ -45,7 +45,7 @@ def test_figures_and_line():
     found = sigma_of(poses)
     assert (found.poses, found.few_features) == (3, 0)
     assert [found.median_m, found.worst_m] == pytest.approx([3e-3, 7e-3]) and [found.median_deg, found.worst_deg] == pytest.approx([0.05, 0.2])
-    assert found.share == pytest.approx({"noise": 6 / 67, "drift": 44 / 67, "calibration": 17 / 67})
+    assert found.share == pytest.approx({"noise": 6 / 67, "drift": 44 / 67, "calibration": 17 / 67, "depth_scale": 0.0})
     line = "σ of ok poses: 3.0 mm, 0.05° (median), 7.0 mm, 0.20° (worst); mostly drift of the map"
     assert sigma_line(found.to_dict(), RUN) == line
 
@@ -62,6 +62,19 @@ def test_figures_and_line():
 def test_what_dominates_is_said_with_its_cure(causes, said):
     line = sigma_line(sigma_of([FIRST, pose(*causes)]).to_dict(), RUN)
     assert line.partition("(worst)")[2] == said
+
+
+def test_the_scale_of_depth_is_a_cause_of_its_own():
+    """0.5 % of 2 m, beside 3 mm of noise and 4 of drift."""
+    moved = np.eye(4)
+    moved[1, 3] = 2.0
+    scaled = pose(3.0, 4.0, depth_scale_sigma=0.005, T_world_camera=moved)
+    by_scale = np.diag([0.0, 0.01**2, 0.0, 0.0, 0.0, 0.0])
+    found = sigma_of([FIRST, replace(scaled, covariance=scaled.covariance + by_scale, map_covariance=scaled.map_covariance + by_scale)])
+    assert found.share == pytest.approx({"noise": 9 / 125, "drift": 16 / 125, "calibration": 0.0, "depth_scale": 100 / 125})
+    assert sigma_line(found.to_dict(), RUN).partition("(worst)")[2] == (
+        "; mostly the scale of depth: measure a length in the room, and state sigmas.depth_scale in camera.yaml"
+    )
 
 
 def test_degraded_frames_with_few_features_are_counted():

@@ -47,7 +47,9 @@ def test_poses_of_a_run_come_back_as_they_were():
     covariances = [half @ half.T for half in rng.random((5, 6, 6))]
     status = (OK, DEGRADED, LOST, OK, OK)
     matrices = [(T, C, R) for (T, R), C in zip(motions, covariances)]
-    said = [Pose(3 * k, 2**60 + k, *matrices[k], k - 1, counts + k, 1, status[k], f"wherefore é {k}", k, 7) for k in range(5)]
+    said = [
+        Pose(3 * k, 2**60 + k, *matrices[k], k - 1, counts + k, 1, status[k], f"wherefore é {k}", k, 7, depth_scale_sigma=0.1 * k) for k in range(5)
+    ]
     kept = Poses(said)
     assert len(kept) == 5 and [pose.index for pose in kept[1:4]] == [3, 6, 9] and kept[-1].reason == "wherefore é 4"
     for pose, again in zip(said, kept):

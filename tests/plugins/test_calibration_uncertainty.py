@@ -196,11 +196,20 @@ def test_moments_of_the_calibration():
     assert calibration_moment(known, known @ off) == pytest.approx(np.outer(off, off), abs=2e-3)
 
 
-def test_a_camera_that_is_mostly_right_is_trusted_in_the_rest():
-    """Parameters that no residual shows are taken to be as good as those that residuals do show."""
+def test_parameters_that_no_residual_shows_keep_what_is_stated_of_them_at_least():
+    """However right the others are; where these are off, they are as uncertain as these."""
     information = np.diag([1e4] * 6 + [0.0] * 6)
-    right, wrong = (calibration_moment(information, information @ np.full(CALIBRATION, off)) for off in (0.0, 1.5))
-    assert right[-1, -1] < 0.5 < 1.0 < wrong[-1, -1]
+    right, wrong = (calibration_moment(information, information @ np.full(CALIBRATION, off)) for off in (0.0, 3.0))
+    assert right[-1, -1] == pytest.approx(1.0) and wrong[-1, -1] > 2.0
+
+
+def test_the_scale_of_depth_is_counted_with_the_way_from_the_first_camera():
+    """3 m along the world's x, which the camera has turned into its z: 0.5 % are 15 mm of its z, and no rotation."""
+    turned = exp_se3(np.array([0.0, 0.0, 0.0, 0.0, np.pi / 2, 0.0]))
+    turned[:3, 3] = 3.0, 0.0, 0.0
+    pose = Pose(0, 0, turned, np.eye(6), np.eye(4), 0, np.zeros(3, np.int32), 0, "ok", "", depth_scale_sigma=0.005)
+    assert calibration_covariance(pose) == pytest.approx(np.diag([0.0, 0.0, 0.015**2, 0.0, 0.0, 0.0]), abs=1e-12)
+    assert carried_calibration(replace(pose, index=1, depth_scale_sigma=0.0), pose).depth_scale_sigma == 0.005
 
 
 def test_a_pose_that_was_not_refined_keeps_the_error_of_the_previous_one():
