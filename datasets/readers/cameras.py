@@ -13,7 +13,7 @@ from trihedron.datasets.readers.images import MAX_PIXELS
 from trihedron.datasets.readers.registration import DepthCamera, Rectification
 from trihedron.pipeline.core.errors import DataError, did_you_mean, printable
 from trihedron.pipeline.core.files import MAX_YAML_BYTES, SHOWN, YamlError, parse_yaml, read_text
-from trihedron.pipeline.core.types import EXACT_DEPTH, CalibrationSigmas, Camera, DepthNoise
+from trihedron.pipeline.core.types import EXACT_CALIBRATION, EXACT_DEPTH, CalibrationSigmas, Camera, DepthNoise
 from trihedron.pipeline.core.value_checks import camera_fault
 
 CAMERA_FILE = "camera.yaml"
@@ -24,6 +24,7 @@ LARGEST_COEFFICIENT = 100.0  # of a distortion; those of lenses are below 10
 LARGEST_RADIAL = 0.5
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")
 NOISES = {"kinect": DepthNoise(), "exact": EXACT_DEPTH}
+NOMINAL = CalibrationSigmas()  # of a camera that nobody calibrated by itself
 SHORT = "give dataset.camera=tum_fr1, tum_fr2, tum_fr3, icl_nuim or a camera.yaml"
 
 
@@ -46,8 +47,8 @@ class Calibration:
         return Rectification(self.camera, self.distortion, self.depth_offset, self.depth_radial, self.depth_camera)
 
 
-def _vga(fx: float, fy: float, cx: float, cy: float, *distortion: float) -> Calibration:
-    return Calibration(Camera(640, 480, fx, fy, cx, cy), 5000.0, distortion)
+def _vga(fx: float, fy: float, cx: float, cy: float, *distortion: float, sigmas: CalibrationSigmas = NOMINAL) -> Calibration:
+    return Calibration(Camera(640, 480, fx, fy, cx, cy, sigmas=sigmas), 5000.0, distortion)
 
 
 PRESETS = {
@@ -56,7 +57,8 @@ PRESETS = {
     "tum_fr2": _vga(520.9, 521.0, 325.1, 249.7, 0.2312, -0.7849, -0.0033, -0.0001, 0.9172),
     "tum_fr3": _vga(535.4, 539.2, 320.1, 247.6),
     "seven_scenes": Calibration(Camera(640, 480, 585.0, 585.0, 320.0, 240.0), 1000.0),  # published with the data set
-    "icl_nuim": _vga(481.2, 480.0, 319.5, 239.5),  # published with fy = -480; the reader reflects the poses instead
+    # rendered by an exact camera; published with fy = -480, and the reader reflects the poses instead
+    "icl_nuim": _vga(481.2, 480.0, 319.5, 239.5, sigmas=EXACT_CALIBRATION),
 }
 FOLDER_NAMES = {  # how the published archives are called
     "tum_fr1": r"freiburg1|(^|[^a-z])fr1",

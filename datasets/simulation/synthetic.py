@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from enum import Enum
 from functools import cache, cached_property, lru_cache
 from typing import Annotated
@@ -28,7 +28,7 @@ from trihedron.datasets.simulation.true_surface import TrueSurface, surface_of
 from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.options import Frames, NonNegativeInt, PositiveFloat, Range
 from trihedron.pipeline.core.registry import register
-from trihedron.pipeline.core.types import EXACT_DEPTH, F32, F64, I32, U8, Bool, CalibrationSigmas, Camera, Frame, Trajectory
+from trihedron.pipeline.core.types import EXACT_CALIBRATION, EXACT_DEPTH, F32, F64, I32, U8, Bool, Camera, Frame, Trajectory
 
 
 class Scene(Enum):
@@ -63,7 +63,6 @@ FLATS: dict[Scene, Callable[[int], Building]] = {Scene.random_flat: random_flat,
 SENSORS = {Sensor.kinect: KINECT, Sensor.stereo: STEREO}
 ROOM_FRAMES = 150  # of the room, whose walk never ends
 FOCAL_PER_WIDTH = 525.0 / 640.0  # a Kinect's nominal colour camera
-EXACT_CALIBRATION = CalibrationSigmas(*(0.0,) * len(fields(CalibrationSigmas)))
 
 
 @register("dataset", "synthetic")

@@ -437,6 +437,9 @@ class CalibrationSigmas:
     depth_scale: Annotated[float, Within(0.0, 1.0)] = 0.005  # of all depths alike, relative
 
 
+EXACT_CALIBRATION = CalibrationSigmas(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
 @dataclass(frozen=True)
 class Camera:
     """An undistorted pinhole camera; readers undistort frames. `fps` is nominal."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -55,6 +56,11 @@ def test_a_camera_file_states_how_well_its_calibration_is_known(tmp_path: Path) 
     assert read_camera_file(tmp_path / "camera.yaml").camera.sigmas == CalibrationSigmas(focal=0.001, registration=0.0)
     (tmp_path / "camera.yaml").write_text(GOOD)
     assert read_camera_file(tmp_path / "camera.yaml").camera.sigmas == CalibrationSigmas()
+
+
+def test_a_rendered_data_set_states_that_its_camera_is_exact() -> None:
+    assert set(asdict(choose_calibration(Path(), "icl_nuim").camera.sigmas).values()) == {0.0}
+    assert choose_calibration(Path(), "tum_fr3").camera.sigmas == CalibrationSigmas()
 
 
 BAD = [
