@@ -6,6 +6,7 @@ either they are taken to be those of the whole ground truth, thinned to the traj
 
 Without a ground truth, --no-reference judges a run by the σ that its poses state, and by its own depth: images moved into later ones by the estimate,
 thickness of walls that several frames saw, entropy of the map, spread of mutually orthogonal planes (Kornilova and Ferrer, 2021). Smaller is better.
+Where the run has a ground truth, a second column has what its depth gives under that: a measured truth is not exact, and no more is depth.
 
 Example: trihedron evaluate runs/latest/trajectory.txt groundtruth.txt
 Example: trihedron evaluate runs/latest --no-reference
@@ -65,18 +66,20 @@ def main(argv: list[str]) -> int:
 
 
 def _without_reference(run: Path, as_json: bool) -> int:
-    from trihedron.tools.quality import quality_of_run
+    from trihedron.tools.quality import quality_of_run, quality_of_truth
 
-    figures = quality_of_run(run).to_dict()
+    figures, truth = quality_of_run(run).to_dict(), quality_of_truth(run)
+    columns = {"value": figures} | ({"by the ground truth": truth.to_dict()} if truth is not None else {})
     if as_json:
-        print(json.dumps(figures, indent=2))
+        print(json.dumps(figures | ({"truth": truth.to_dict()} if truth is not None else {}), indent=2))
         return 0
-    rows = [["figure without truth", "value"]]
-    for name, value in figures.items():
+    rows = [["figure without truth", *columns]]
+    for name in figures:
         length = name.endswith("_m")
-        text = "-" if value is None else f"{1e3 * value:.2f} mm" if length else f"{value:g}"
-        rows.append([name.removesuffix("_m") if length else name, text])
-    print(table(rows, "lr"))
+        values = [column[name] for column in columns.values()]
+        texts = ["-" if value is None else f"{1e3 * value:.2f} mm" if length else f"{value:g}" for value in values]
+        rows.append([name.removesuffix("_m") if length else name, *texts])
+    print(table(rows, "l" + "r" * len(columns)))
     return 0
 
 

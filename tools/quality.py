@@ -11,6 +11,8 @@ Four kinds of figure, all in metres but the entropy:
   no-reference trajectory metric on registered point clouds", ECMR 2021, who take the mean: a ball that holds furniture, too, would decide it).
 - `wall_thickness_m`: on planar parts that several frames have seen, the standard deviation of the positions at which the frames saw them, along the
   normal, median over the parts. A mean over the points of a frame has little noise: drift remains, and what is wrong with the sensor's depth.
+
+A ground truth is judged by the same figures, without σ. They hold the errors of the sensor's depth as well as those of the truth.
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +30,9 @@ from scipy.spatial import cKDTree
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.geometry import invert
 from trihedron.pipeline.core.types import F64, Frame
+
+if TYPE_CHECKING:
+    from trihedron.pipeline.record.reader import Recording
 
 Rows = NDArray[np.int64]
 APART = (1, 10, 30)  # frames between those that are compared
@@ -84,12 +89,38 @@ class Parts:
 
 def quality_of_run(run: Path) -> Quality:
     """Judge a run folder or recording. Raises DataError where its frames are gone, or fewer than two are posed."""
-    from trihedron.pipeline.app.recorded_values import frames_of, references_of, trajectory_of
     from trihedron.pipeline.core.types import Pose
     from trihedron.pipeline.record.reader import Recording
     from trihedron.pipeline.run.stated_sigma import stated_sigma
 
     recording = Recording(run)
+    frames, _, count = _posed_frames(recording)
+    stated = stated_sigma([pose for pose in recording.values("pose") if isinstance(pose, Pose)] if "pose" in recording.topics else [], [])
+    return quality_of(frames, count, stated.median_m if stated is not None else None)
+
+
+def quality_of_truth(run: Path) -> Quality | None:
+    """Judge the ground truth of a run by the same frames; None where fewer than two of them have one. Raises as `quality_of_run`."""
+    from trihedron.pipeline.record.reader import Recording
+    from trihedron.pipeline.record.trajectories import attached_truth
+    from trihedron.pipeline.run.metrics import associate
+
+    recording = Recording(run)
+    truth = attached_truth(recording.attachments, str(recording.path))
+    if truth is None:
+        return None
+    frames, stamps_ns, count = _posed_frames(recording)
+    pairs = associate(stamps_ns, truth.stamps_ns)
+    if len(pairs) < 2:
+        return None
+    rows = pairs[:, 0].tolist()
+    return quality_of(PosedFrames(frames.numbers[rows], truth.poses[pairs[:, 1]], lambda row: frames.read(rows[row])), count)
+
+
+def _posed_frames(recording: Recording) -> tuple[PosedFrames, Rows, int]:
+    """Return the posed frames of a recording, their stamps (n,), and the number of all frames. Raises DataError for fewer than two."""
+    from trihedron.pipeline.app.recorded_values import frames_of, references_of, trajectory_of
+
     references = {reference.stamp_ns: reference for reference in references_of(recording).values()}
     trajectory, frame_of = trajectory_of(recording), frames_of(recording)
     posed = [row for row, stamp in enumerate(trajectory.stamps_ns.tolist()) if stamp in references]
@@ -101,9 +132,8 @@ def quality_of_run(run: Path) -> Quality:
     def read(row: int) -> Frame | None:
         return frame_of(known[row])
 
-    stated = stated_sigma([pose for pose in recording.values("pose") if isinstance(pose, Pose)] if "pose" in recording.topics else [], [])
     frames = PosedFrames(np.array([reference.index for reference in known]), trajectory.poses[posed], read)
-    return quality_of(frames, len(references), stated.median_m if stated is not None else None)
+    return frames, trajectory.stamps_ns[posed], len(references)
 
 
 def quality_of(frames: PosedFrames, count: int, sigma_m: float | None = None) -> Quality:
