@@ -20,12 +20,13 @@ from typing import Any
 import numpy as np
 import yaml
 
-from trihedron.datasets.readers.cameras import Calibration, choose_calibration
+from trihedron.datasets.readers.cameras import PRESETS, Calibration, choose_calibration
 from trihedron.datasets.readers.registration import DepthCamera
+from trihedron.pipeline.app.calibrated_run import Recommendation
 from trihedron.pipeline.core.errors import DataError, UsageError
 from trihedron.pipeline.core.files import write_file
 from trihedron.pipeline.core.text_table import table
-from trihedron.pipeline.core.types import F64, CalibrationSigmas, Camera
+from trihedron.pipeline.core.types import EXACT_DEPTH, F64, CalibrationSigmas, Camera
 from trihedron.pipeline.record.reader import Recording
 from trihedron.tools import calibration_edges, calibration_pairs
 from trihedron.tools.arguments import Parser
@@ -81,6 +82,21 @@ def main(argv: list[str]) -> int:
         write_file(arguments.out, _as_yaml(keys_of(changed)))
         print(f"written: {arguments.out}" + ("" if changed != used else ", as the camera file in use"))
     return 0
+
+
+def recommend(recording: Recording) -> Recommendation:
+    """Return what is recommended of the recording's camera, as `calibrate=true` applies it. Raises as `main` does."""
+    recorded = read_recording(recording)
+    used = calibration_in_use(recording, recorded.camera)
+    if not used.depth_scale:
+        raise DataError(str(recording.path), "is not of a data set with a camera file", "run it without calibrate=true")
+    found = estimate(recorded)
+    changed = with_estimates(used, found)
+    before, after = keys_of(used), _changed_keys(used, changed)
+    gains = [(name, one) for name, one in found.judgements.items() if one.recommended and name != "readout"]  # which nothing applies
+    changes = [f"{name}: the half that was held out is {100 * one.gain:.1f} ± {100 * one.sigma:.1f} % better" for name, one in gains]
+    changes += [f"{key} is {_in_a_line(value)}, was {_in_a_line(before[key]) if key in before else 'not stated'}" for key, value in after.items()]
+    return Recommendation(_as_yaml(keys_of(changed)) if changed != used else "", 1e3 * float(found.edges[5]), changes)
 
 
 def _as_yaml(keys: dict[str, Any]) -> str:
@@ -220,7 +236,7 @@ def calibration_in_use(recording: Recording, camera: Camera) -> Calibration:
     options = composed_run(recording).dataset
     folder, plugin = Path(str(options.get("path", ""))).expanduser(), str(options.get("plugin", ""))
     try:
-        found = choose_calibration(folder, str(options.get("camera", "")), default="seven_scenes" if plugin == "seven_scenes" else "")
+        found = choose_calibration(folder, str(options.get("camera", "")), default=plugin if plugin in PRESETS else "")
     except (DataError, OSError):
         return Calibration(camera, 0.0)
     return found if (found.camera.width, found.camera.fx) == (camera.width, camera.fx) else Calibration(camera, 0.0)
@@ -260,6 +276,7 @@ def keys_of(calibration: Calibration) -> dict[str, Any]:
     keys |= {"depth_scale": calibration.depth_scale, "fps": camera.fps}
     keys |= {"distortion": list(calibration.distortion)} if calibration.distortion else {}
     keys |= {name: round(value, 6) for name in ("depth_offset", "depth_radial") if (value := getattr(calibration, name))}
+    keys |= {"depth_noise": "exact"} if camera.depth_noise == EXACT_DEPTH else {}
     usual = asdict(CalibrationSigmas())
     if sigmas := {name: value for name, value in asdict(camera.sigmas).items() if value != usual[name]}:
         keys["sigmas"] = sigmas
@@ -273,6 +290,11 @@ def keys_of(calibration: Calibration) -> dict[str, Any]:
 
 def _round_each(values: Sequence[float]) -> list[float]:
     return [round(float(value), 5) for value in values]
+
+
+def _in_a_line(value: Any) -> str:
+    """A value of a camera file."""
+    return str(yaml.safe_dump(value, sort_keys=False, default_flow_style=True, width=1000)).removesuffix("\n...\n").rstrip()
 
 
 def _changed_keys(used: Calibration, changed: Calibration) -> dict[str, Any]:

@@ -65,6 +65,7 @@ Usage: trihedron run [-m] [key=value ...]
   replay=FILE.mcap 'only=[STAGE]'    compute these stages again, read the rest from a recording
   save_map=FILE.mcap                 keep the map, to go on from    load_map=FILE.mcap  go on from it, or find the camera in it
   localise_only=true                 the loaded map stays as it is
+  calibrate=true                     track twice: first to calibrate the camera, then with what is recommended (OUT/camera.yaml)
   view=foxglove | view=rerun         watch the run; view.web=true serves rerun to a browser; view.port=8765, view.host=127.0.0.1
                                      what is served stays until Ctrl-C, with view.keep=false it ends with the run
   live=true                          play the data set in real time; frames that come while it is busy are dropped, latency is reported

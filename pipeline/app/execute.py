@@ -19,6 +19,7 @@ from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 from trihedron.pipeline.app.budgets import budget_of
+from trihedron.pipeline.app.calibrated_run import UNCALIBRATED, calibrated_config, check_calibrated, check_camera_file, comparison_line, uncalibrated
 from trihedron.pipeline.app.compilation import compile_once
 from trihedron.pipeline.app.trajectory_plot import trajectory_figure
 from trihedron.pipeline.app.viewers import Viewer, opened_viewer
@@ -42,7 +43,7 @@ from trihedron.pipeline.run.interrupts import defer_interrupts
 from trihedron.pipeline.run.live import Pace, shows_once
 from trihedron.pipeline.run.map_file import load_map, save_map
 from trihedron.pipeline.run.replay import TOPICS, Replay
-from trihedron.pipeline.run.run_folder import FolderBefore, claim_folder, point_latest, remove_models, write_configuration
+from trihedron.pipeline.run.run_folder import FolderBefore, check_replaced, claim_folder, point_latest, remove_models, write_configuration
 from trihedron.pipeline.run.runner import Runner, Step
 from trihedron.pipeline.run.state import DelayLines, max_delays
 from trihedron.pipeline.run.stated_sigma import sigma_line
@@ -61,12 +62,30 @@ def execute(config: DictConfig, out: Path, overrides: list[str], began: float, k
 
     Raises TrihedronError. Whatever happens after the first frame, the recording is closed and the trajectory so far is written."""
     with opened_viewer(config) as viewer:
-        metrics = _execute(config, out, overrides, began, viewer)
+        metrics = _execute_twice(config, out, overrides, began, viewer) if config.calibrate else _execute(config, out, overrides, began, viewer)
         if not config.replay:  # a part of a run, and no run to look at
             point_latest(out)
         if keep and config.get("view") is not None and config.view.keep:
             viewer.keep()
         return metrics
+
+
+def _execute_twice(config: DictConfig, out: Path, overrides: list[str], began: float, viewer: Viewer) -> dict[str, Any]:
+    """Track with the stated camera, calibrate from that, and run with what is recommended. What the run would be refused for is refused before."""
+    check_settings(config)
+    graph = graph_of(config)
+    check_calibrated(config)
+    remembered_of(config, graph), recorded_topics(config, graph, None)
+    check_replaced(out, config, graph.stages)
+    check_camera_file(config, out)
+    first = out / UNCALIBRATED
+    print(f"calibrate: the stated camera is tracked first, into {first}", flush=True)
+    before = _execute(*uncalibrated(config, first, overrides), began, Viewer())
+    calibrated = calibrated_config(config, out)
+    after = _execute(calibrated, out, overrides, time.perf_counter(), viewer)
+    if calibrated is not config:
+        print(comparison_line(before, after, out))
+    return after
 
 
 def _execute(config: DictConfig, out: Path, overrides: list[str], began: float, viewer: Viewer) -> dict[str, Any]:

@@ -112,6 +112,7 @@ class RunOptions:
     save_map: str = ""  # write the map, and all that is needed to go on, to this file
     load_map: str = ""  # go on from such a file
     localise_only: bool = False  # the loaded map stays as it is
+    calibrate: bool = False  # track the sequence once before, and run with the camera that it shows
     live: bool = False  # frames come at the camera's rate, and those for which the run comes too late are dropped
     budget_ms: float | None = None  # mean time from when a frame is there to its pose; above it the words of budget_order hold, one after the other
     budget_order: list[str] = dataclasses.field(default_factory=list)  # [] = budgets.USUAL

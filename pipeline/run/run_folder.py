@@ -68,15 +68,19 @@ def _identity(path: Path) -> tuple[int, int] | None:
 @contextmanager
 def claim_folder(folder: Path, config: DictConfig, computed: Collection[str]) -> Iterator[bool]:
     """Make the folder of a run of this configuration, which computes these stages, and lock it for the block, as `lock_folder` does; True where it is
-    that of an earlier run. Raises TrihedronError, before anything is written, where results would be replaced that the run reads, or that a user
-    corrected by hand."""
+    that of an earlier run. Raises TrihedronError, before anything is written, as `check_replaced` does."""
+    check_replaced(folder, config, computed)
+    earlier = (folder / CONFIG).is_dir()
+    with lock_folder(folder):
+        yield earlier
+
+
+def check_replaced(folder: Path, config: DictConfig, computed: Collection[str]) -> None:
+    """Raise TrihedronError where a run would replace results that it reads, or that a user corrected by hand."""
     _check_sources(folder / RECORDING, config)
     for slot, files in files_of_folds().items() if _other_files(folder) else ():
         if files.check is not None:
             files.check(folder, config.get(slot) if slot in computed else None)
-    earlier = (folder / CONFIG).is_dir()
-    with lock_folder(folder):
-        yield earlier
 
 
 def _check_sources(recording: Path, config: DictConfig) -> None:

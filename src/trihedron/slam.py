@@ -49,7 +49,7 @@ from trihedron.pipeline.run.warm_up import WARM_UP_FRAMES, compilation_reported,
 from trihedron.trajectory import Trajectory
 from trihedron.words import words_of
 
-REFUSED = ("replay", "only", "live", "real_time", "save_map", "sequences")  # root keys of a run that make no sense for pushed frames
+REFUSED = ("replay", "only", "live", "real_time", "save_map", "calibrate", "sequences")  # root keys of a run that make no sense for pushed frames
 WARM_UP_PX = 640  # the largest width of the images of the warm-up
 P = ParamSpec("P")
 R = TypeVar("R")

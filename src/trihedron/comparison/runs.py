@@ -42,12 +42,12 @@ class Run:
 
 
 def run_folders(folder: Path) -> list[Path]:
-    """The run folders in a folder, itself or the jobs of a sweep, by job number. Raises DataError when it holds none, or does not
+    """The run folders in a folder, itself or else the jobs of a sweep, by job number. Raises DataError when it holds none, or does not
     exist."""
     if not folder.exists():
         cause = "does not exist" if folder.is_absolute() else f"does not exist in {Path.cwd()}"
         raise DataError(str(folder), cause, "give the out=FOLDER of a run or of a sweep")
-    files = [*folder.glob(".hydra/overrides.yaml"), *folder.glob("*/.hydra/overrides.yaml")]
+    files = [*folder.glob(".hydra/overrides.yaml")] or [*folder.glob("*/.hydra/overrides.yaml")]
     if not files:
         raise DataError(str(folder), "holds no runs", "give the out=FOLDER of a sweep, for example of: trihedron run -m experiment=leave_one_out")
     return [file.parent.parent for file in sorted(files, key=lambda f: (len(str(f)), str(f)))]
