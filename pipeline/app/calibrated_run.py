@@ -16,7 +16,8 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from trihedron.pipeline.core.errors import ConfigError
+from trihedron.pipeline.core.config import make_plugin
+from trihedron.pipeline.core.errors import ConfigError, DataError
 from trihedron.pipeline.core.files import write_file
 from trihedron.pipeline.core.overrides import literal_text
 from trihedron.pipeline.core.registry import load_plugins, options_of, plugins_of
@@ -24,6 +25,7 @@ from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.run.run_folder import CONFIG, CURE
 
 UNCALIBRATED, CAMERA = "uncalibrated", "camera.yaml"  # in the run folder: what is tracked with the stated camera, and what is recommended
+LEAST_PAIRED = 0.9  # of the frames, with another delay of depth
 NEEDED = ("keypoints", "matches", "map")  # stages
 FIRST = {  # root keys of the first pass
     "calibrate": False,
@@ -93,10 +95,11 @@ def calibrated_config(config: DictConfig, out: Path) -> DictConfig:
     if found.camera:
         write_file(file, found.camera)
         changed["camera"] = str(file)
-    if found.delay_ms and "depth_delay_ms" in config.dataset:
-        changed["depth_delay_ms"] = round(config.dataset.depth_delay_ms + found.delay_ms, 1)
-    elif found.delay_ms:
-        print(f"calibrate: depth is {found.delay_ms:.1f} ms late, which stays so: dataset={config.dataset.plugin} has no depth_delay_ms")
+    if found.delay_ms:
+        delay_ms, obstacle = _delay_to_apply(config, found.delay_ms)
+        changed |= {} if obstacle else {"depth_delay_ms": delay_ms}
+        if obstacle:
+            print(f"calibrate: depth is {found.delay_ms:.1f} ms late, and stays so: {obstacle}")
     if not changed:
         print("calibrate: no change recommended, the run has the stated camera")
         return config
@@ -107,9 +110,28 @@ def calibrated_config(config: DictConfig, out: Path) -> DictConfig:
     return config
 
 
+def _delay_to_apply(config: DictConfig, more_ms: float) -> tuple[float, str]:
+    """Return the delay of depth with what is recommended, and why it is not applied, if it is not: frames lose their depth image where no other is
+    near enough in time."""
+    if "depth_delay_ms" not in config.dataset:
+        return 0.0, f"dataset={config.dataset.plugin} has no depth_delay_ms"
+    delayed = config.copy()
+    delayed.dataset.depth_delay_ms = round(config.dataset.depth_delay_ms + more_ms, 1)
+    frames, paired = _count_frames(config), _count_frames(delayed)
+    few = paired < LEAST_PAIRED * frames
+    return delayed.dataset.depth_delay_ms, f"with it {paired} of {frames} frames have a depth image within dataset.max_difference_ms" if few else ""
+
+
+def _count_frames(config: DictConfig) -> int:
+    try:
+        return len(make_plugin("dataset", config.dataset))
+    except DataError:  # no pairs at all
+        return 0
+
+
 def recommendation(folder: Path) -> Recommendation:
     """Return what `trihedron calibrate` recommends by the recording in a folder."""
-    (command,) = entry_points(group="trihedron.commands", name="calibrate")
+    command = next(iter(entry_points(group="trihedron.commands", name="calibrate")))
     found: Recommendation = import_module(command.module).recommend(Recording(folder))
     return found
 

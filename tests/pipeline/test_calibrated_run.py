@@ -116,8 +116,15 @@ def test_the_delay_of_depth_is_applied_where_the_data_set_has_one(right, tmp_pat
     configs = [read(folder / ".hydra" / "config.yaml")["dataset"]["depth_delay_ms"] for folder in (tmp_path / "a" / "uncalibrated", tmp_path / "a")]
     assert configs == [1.0, 5.3] and not (tmp_path / "a" / "camera.yaml").exists()
     assert main(["run", "dataset=folder", *words, f"out={tmp_path / 'b'}"]) == 0
-    line = "calibrate: depth is 4.3 ms late, which stays so: dataset=folder has no depth_delay_ms\n"
+    line = "calibrate: depth is 4.3 ms late, and stays so: dataset=folder has no depth_delay_ms\n"
     assert f"{line}calibrate: no change recommended, the run has the stated camera\n" in capsys.readouterr().out
+
+
+def test_a_delay_that_leaves_frames_without_depth_is_not_applied(right, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(calibrated_run, "recommendation", lambda folder: Recommendation("", 40.0, []))
+    assert main(["run", "dataset=tum", f"dataset.path={right}", "calibrate=true", f"out={tmp_path}"]) == 0
+    line = "calibrate: depth is 40.0 ms late, and stays so: with it 0 of 12 frames have a depth image within dataset.max_difference_ms\n"
+    assert line in capsys.readouterr().out and read(tmp_path / ".hydra" / "config.yaml")["dataset"]["depth_delay_ms"] == 0.0
 
 
 @pytest.mark.parametrize("words, line", [

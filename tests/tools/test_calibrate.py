@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -12,7 +13,7 @@ from trihedron.datasets.readers.cameras import Calibration, read_camera_file
 from trihedron.datasets.readers.registration import DepthCamera
 from trihedron.datasets.simulation.synthetic import Synthetic
 from trihedron.pipeline.app.cli import main
-from trihedron.pipeline.core.types import Camera
+from trihedron.pipeline.core.types import EXACT_DEPTH, Camera, DepthNoise
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import write_trajectory
 from trihedron.tools.calibrate import Estimates, _as_yaml, keys_of, with_estimates
@@ -75,9 +76,10 @@ def test_a_recommended_camera_projects_depth_where_the_edges_are():
     assert np.allclose(color.project(point[None])[0], expected, atol=1e-6)
 
 
-def test_the_file_that_is_written_is_read_back(tmp_path):
+@pytest.mark.parametrize("noise", [DepthNoise(), EXACT_DEPTH])
+def test_the_file_that_is_written_is_read_back(tmp_path, noise):
     depth = DepthCamera(589.137, 589.137, 314.246, 244.402, (-0.04075, 0.00441, 0.0), (0.1, 0.0, -0.2))
-    given = Calibration(CAMERA, 1000.0, (0.1, 0.0, 0.0, 0.0, 0.0), 0.012, -0.01, depth)
+    given = Calibration(replace(CAMERA, depth_noise=noise), 1000.0, (0.1, 0.0, 0.0, 0.0, 0.0), 0.012, -0.01, depth)
     (tmp_path / "camera.yaml").write_text(yaml.safe_dump(keys_of(given)))
     assert read_camera_file(tmp_path / "camera.yaml") == given
 
