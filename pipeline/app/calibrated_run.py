@@ -101,7 +101,7 @@ def calibrated_config(config: DictConfig, out: Path) -> DictConfig:
         if obstacle:
             print(f"calibrate: depth is {found.delay_ms:.1f} ms late, and stays so: {obstacle}")
     if not changed:
-        print("calibrate: no change recommended, the run has the stated camera")
+        print(f"calibrate: {'' if found.delay_ms else 'no change recommended, '}the run has the stated camera")
         return config
     print("calibrate: the run has " + " ".join(f"dataset.{key}={value}" for key, value in changed.items()))
     config = config.copy()
