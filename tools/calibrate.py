@@ -1,10 +1,11 @@
 """Estimate a camera's calibration from a run, and recommend what makes the half of the recording better that it was not estimated from.
 
 Edges of depth are laid on gradients of colour: registration of the depth camera (focal length, centre, offset), and the delay of depth. Points that
-pairs of frames observed give fx and fy against depth, errors of depth that grow with range (`depth_offset`, 1/m, added to inverse depths) and towards
-the corners of the image (`depth_radial`), and the readout time of a rolling shutter. A scale of all depths is not observable. The gain of a change is
-the relative decrease of the cost on blocks of frames that were held out, with its standard error over the blocks; what does not gain significantly is
-not recommended. Where something is recommended, the lines for camera.yaml are printed, and --out writes the whole file: run again with it.
+pairs of frames observed give fx and fy against depth, errors of depth that grow with range (`depth_offset`, 1/m, added to inverse depths) and
+towards the corners of the image (`depth_radial`), and the readout time of a rolling shutter. A scale of all depths is not observable. The gain of a
+change is the relative decrease of the cost on blocks of frames that were held out, with its standard error over the blocks; what does not gain
+significantly is not recommended, nor is a registration that moves depth by less than its edges may be off. Where something is recommended, the lines
+for camera.yaml are printed, and --out writes the whole file: run again with it.
 
 Example: trihedron calibrate runs/a/run.mcap --out camera.yaml
 """
@@ -30,7 +31,7 @@ from trihedron.pipeline.core.types import EXACT_DEPTH, F64, CalibrationSigmas, C
 from trihedron.pipeline.record.reader import Recording
 from trihedron.tools import calibration_edges, calibration_pairs
 from trihedron.tools.arguments import Parser
-from trihedron.tools.calibration_edges import Edges, block_scores, edges_of, register_depth
+from trihedron.tools.calibration_edges import EDGE_BIAS_PX, Edges, block_scores, edges_of, moved_px, register_depth
 from trihedron.tools.calibration_judgement import Costs, Judgement, judge
 from trihedron.tools.calibration_pairs import Fit, Pairs, fit, scale_of
 from trihedron.tools.calibration_recording import Recorded, pairs_of, read_recording
@@ -158,6 +159,9 @@ def _by_edges(edges: Edges, judgements: dict[str, Judgement]) -> tuple[F64, tupl
     parameters[5] = parameters[5] if DELAY[0] in chosen else 0.0
     if not accepted and chosen:
         parameters = register_depth(edges, chosen).parameters
+    if accepted and moved_px(edges, parameters) < EDGE_BIAS_PX:  # what edges are off must not become a delay, so that it is estimated all the same
+        judgements["registration"] = replace(judgements["registration"], recommended=False)
+        parameters[:5] = 0.0
     return parameters, (everything.parameters, np.sqrt(np.diag(everything.covariance)))
 
 

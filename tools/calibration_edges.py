@@ -4,10 +4,11 @@ The near side of a jump of depth, at pixel p and depth z, was seen by a camera o
 
     X = z ((p - c_d) / f_d, 1) + t,  moved by the camera's motion during the delay τ of depth,  u = f_c X / Z + c_c
 
-The parameters are log(f_c / f_d), the shift s in `u = f_c / f_d (p - c_c) + c_c + s + …` (px), the sideways offset t (m) and τ (s). They maximise the
-mean gradient of the colour image at u over the edges of all frames, in units of the image's mean gradient. Depths that differ separate t from s;
-motion determines τ. The covariance is that of an M-estimator whose terms are blocks of frames ("sandwich": Huber, 1967), since neighbouring frames
-err alike.
+The parameters are log(f_c / f_d), the shift s in `u = f_c / f_d (p - c_c) + c_c + s + …` (px), the sideways offset t (m) and τ (s). They maximise
+the mean gradient of the colour image at u over the edges of all frames, in units of the image's mean gradient. Depths that differ separate t from s;
+motion determines τ. Edges of depth are themselves beside those of things: structured light and stereo find the best match of a window of about 9 px,
+and on the side of the projector's shadow none (Konolige and Mihelich, Technical description of Kinect calibration, 2010). The covariance is that of
+an M-estimator whose terms are blocks of frames ("sandwich": Huber, 1967), since neighbouring frames err alike.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from trihedron.pipeline.run.registration_check import color_gradient, depth_edge
 I64 = NDArray[np.int64]
 MIN_EDGES, MAX_EDGES = 60, 200  # of a frame that takes part; more are thinned
 BLURS_PX = (4.0, 1.5)  # of the image, at 640 a line: for the search, then for the estimate
+EDGE_BIAS_PX = 4.0  # by which edges of depth may be off: half a window of correlation
 NAMES = ("log_scale", "shift_x_px", "shift_y_px", "offset_x_m", "offset_y_m", "delay_s")
 PRIOR = np.array([0.1, 8.0, 8.0, 0.05, 0.05, 0.03])  # standard deviations, px at 640 a line
 PRIOR_WEIGHT = 0.002  # of the prior's squares, in units of the score
@@ -87,6 +89,13 @@ def project_edges(edges: Edges, parameters: F64) -> F64:
     rate, velocity = edges.motions[:, :3], edges.motions[:, 3:]
     points = points + delay_s * (velocity + np.cross(rate, points))
     return np.asarray(focal * points[:, :2] / np.maximum(points[:, 2:], 1e-3) + center, np.float64)
+
+
+def moved_px(edges: Edges, parameters: F64) -> float:
+    """Return the root mean square of the distances (px) by which a registration moves the edges; their delay does not count."""
+    at_rest = np.append(parameters[:5], 0.0)
+    moved = project_edges(edges, at_rest) - edges.pixels
+    return float(np.sqrt((moved**2).sum(axis=1).mean()))
 
 
 def gradients_at(edges: Edges, parameters: F64, blur: int = -1) -> F64:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import t as student
 
-SIGNIFICANCE, LEAST_GAIN = 0.005, 0.003  # six changes are judged, so that 3 % of the recordings of a perfect camera have one by chance
+SIGNIFICANCE, LEAST_GAIN = 0.005, 0.01  # six changes are judged, so that 3 % of the recordings of a perfect camera have one by chance
 BLOCKS, BLOCK_FRAMES = 12, 4  # at most; frames of a block, at least
 Costs = Mapping[int, float]  # block -> cost, smaller is better
 

@@ -10,7 +10,7 @@ import pytest
 
 from trihedron.pipeline.core.types import F32, F64, U8, Camera, Frame
 from trihedron.tools.calibrate import REGISTRATIONS, _by_edges
-from trihedron.tools.calibration_edges import NAMES, Edges, edges_of, register_depth
+from trihedron.tools.calibration_edges import NAMES, Edges, edges_of, moved_px, register_depth
 from trihedron.tools.calibration_judgement import Judgement, blocks_of
 
 CAMERA = Camera(320, 240, 262.5, 262.5, 159.5, 119.5)
@@ -65,7 +65,6 @@ def test_scale_shift_offset_and_delay_are_found() -> None:
     assert (sigmas < [0.02, 4.0, 4.0, 0.02, 0.02, 0.01]).all()
 
 
-@pytest.mark.slow
 def test_depth_of_another_camera_is_registered_by_the_recommendation() -> None:
     judgements: dict[str, Judgement] = {}
     recommended, _ = _by_edges(edges(True), judgements)
@@ -74,7 +73,19 @@ def test_depth_of_another_camera_is_registered_by_the_recommendation() -> None:
     assert abs(recommended[0] - TRUE[0]) < 0.01 and len(REGISTRATIONS) == 3
 
 
-@pytest.mark.slow
+def test_a_registration_within_the_window_of_a_sensor_is_not_recommended() -> None:
+    """A shift of 3 px of the image is found, and may be that of the edges alone."""
+    rng = np.random.default_rng(7)
+    motions = np.concatenate([rng.normal(0.0, 0.5, (FRAMES, 3)), rng.normal(0.0, 0.3, (FRAMES, 3))], axis=1)
+    shifted = np.array([0.0, 6.0, 0.0, 0.0, 0.0, 0.0])
+    found = edges_of([frame(index, shifted, motion) for index, motion in enumerate(motions)], motions, blocks_of(FRAMES))
+    assert moved_px(found, register_depth(found, (1, 2, 5)).parameters) == pytest.approx(3.0, abs=0.3)
+    judgements: dict[str, Judgement] = {}
+    recommended, _ = _by_edges(found, judgements)
+    assert not recommended[:5].any() and not judgements["registration"].recommended
+    assert judgements["registration"].gain > 0.05
+
+
 def test_depth_that_is_registered_is_left_alone() -> None:
     judgements: dict[str, Judgement] = {}
     recommended, (everything, sigmas) = _by_edges(edges(False), judgements)
