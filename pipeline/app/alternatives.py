@@ -18,6 +18,7 @@ import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
 from trihedron.pipeline.app.budgets import budget_of
+from trihedron.pipeline.app.calibrated_run import recommended_words
 from trihedron.pipeline.app.compilation import compile_once
 from trihedron.pipeline.app.execute import (
     Warnings,
@@ -48,7 +49,7 @@ from trihedron.pipeline.run.side_by_side import SideBySide, changed_stages, swap
 from trihedron.pipeline.run.timing import begin_together
 from trihedron.pipeline.run.warm_up import WARM_UP_FRAMES, compilation_reported
 
-NOT_REPEATED = ("out", "report", "replay", "only", "feedback", "view", "save_map", "live", "real_time", "threads")  # words of the recorded command
+NOT_REPEATED = ("out", "report", "replay", "only", "feedback", "view", "save_map", "live", "real_time", "calibrate", "threads")  # recorded words
 FLUSH_SECONDS = 5.0  # between two writes of a recording: an alternative that is killed is computed again
 Frames = Callable[[int, Sequence[Mapping[str, Any]]], None]
 
@@ -166,9 +167,10 @@ class Alternatives:
         if self.feedback is Feedback.recorded:
             replay = [f"replay={self.recording.path.resolve()}", f"only=[{','.join(sorted(self.stages))}]", "feedback=recorded"]
             return [*replay, *alternative.words]
-        changed = {word.lstrip("+").partition("=")[0] for word in alternative.words}
+        calibrated = recommended_words(alternative.config) if "calibrate=true" in map(str.lower, self.recording.overrides()) else []
+        changed = {word.lstrip("+").partition("=")[0] for word in (*calibrated, *alternative.words)}
         given = [word for word in self.recording.overrides() if word.lstrip("+").partition("=")[0] not in {*NOT_REPEATED, *changed}]
-        return [*given, *alternative.words]
+        return [*given, *calibrated, *alternative.words]
 
     def _open_recording(self, alternative: Alternative, folder: Path) -> RecordingWriter:
         config, words = self._as_run(alternative), self._words(alternative)

@@ -19,7 +19,7 @@ from omegaconf import DictConfig, OmegaConf
 from trihedron.pipeline.core.config import make_plugin
 from trihedron.pipeline.core.errors import ConfigError, DataError
 from trihedron.pipeline.core.files import write_file
-from trihedron.pipeline.core.overrides import literal_text
+from trihedron.pipeline.core.overrides import literal_text, quote
 from trihedron.pipeline.core.registry import load_plugins, options_of, plugins_of
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.run.run_folder import CONFIG, CURE
@@ -108,6 +108,11 @@ def calibrated_config(config: DictConfig, out: Path) -> DictConfig:
     for key, value in changed.items():
         config.dataset[key] = literal_text(value) if isinstance(value, str) else value
     return config
+
+
+def recommended_words(config: DictConfig) -> list[str]:
+    """Return the words by which a run has what an earlier one with calibrate=true was recommended, by the configuration of that."""
+    return [f"dataset.{key}={quote(str(config.dataset[key]))}" for key in ("camera", "depth_delay_ms") if config.dataset.get(key)]
 
 
 def _delay_to_apply(config: DictConfig, more_ms: float) -> tuple[float, str]:

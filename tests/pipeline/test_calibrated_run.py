@@ -80,6 +80,14 @@ def test_the_two_passes_can_be_compared_reported_and_replayed(wrong, tmp_path, c
     assert config["dataset"]["camera"] == str(run.folder / "camera.yaml") and config["calibrate"] is False
 
 
+def test_an_ablation_repeats_the_camera_and_not_the_calibration(wrong, tmp_path):
+    _, _, run = wrong
+    ablation = run.recording.ablate("manhattan.cone_deg=8", out=tmp_path / "ablation")
+    for folder in ablation.folders.values():
+        words = read(folder / ".hydra" / "overrides.yaml")
+        assert f"dataset.camera={run.folder / 'camera.yaml'}" in words and not any(word.startswith("calibrate") for word in words)
+
+
 def test_a_right_camera_stays_and_the_result_is_that_of_a_plain_run(right, tmp_path, capsys):
     words = ["run", "dataset=tum", f"dataset.path={right}"]
     assert main([*words, f"out={tmp_path / 'plain'}"]) == 0
