@@ -83,7 +83,7 @@ def test_the_two_passes_can_be_compared_reported_and_replayed(wrong, tmp_path, c
 def test_an_ablation_repeats_the_camera_and_not_the_calibration(wrong, tmp_path):
     _, _, run = wrong
     ablation = run.recording.ablate("manhattan.cone_deg=8", out=tmp_path / "ablation")
-    for folder in ablation.folders.values():
+    for (folder,) in ablation.folders.values():
         words = read(folder / ".hydra" / "overrides.yaml")
         assert f"dataset.camera={run.folder / 'camera.yaml'}" in words and not any(word.startswith("calibrate") for word in words)
 
