@@ -21,6 +21,7 @@ from trihedron.pipeline.core.described import Described
 Array = NDArray[Any]
 CHUNK = 256  # rows whose memory is freed together
 GROWTH = 1.5
+LARGE = 1 << 20  # bytes of a column whose pages always come from the system
 PAGED = 32_768  # bytes of a column from which on its pages come from the system
 
 
@@ -165,9 +166,12 @@ class Table(Described):
         return number in self.freed
 
     def _copy(self, name: str, capacity: int, freed: frozenset[int]) -> _Buffer:
-        """Copy a column into memory of its own, but for the chunks that are freed: zeros that nobody wrote take no memory."""
+        """Copy a column into memory of its own, but for the chunks that are freed. Where there are such they take no memory: zeros that nobody wrote.
+        A column without is copied into memory that the process returned, since pages of the system cost ten times as much as the copy; not a large
+        one, which would leave holes."""
         column, known = self.schema[name], self._buffers[name].rows
-        rows = _zeros((capacity, *column.shape), column.element)
+        shape = capacity, *column.shape
+        rows = _zeros(shape, column.element) if freed or capacity * column.row_bytes > LARGE else np.empty(shape, column.element)
         live = np.zeros(-(-self.size // CHUNK) + 2, np.bool_)  # one more before and behind
         live[1:-1] = True
         live[1 + np.fromiter(freed, np.intp, len(freed))] = False
