@@ -66,12 +66,15 @@ def main(argv: list[str]) -> int:
 
 
 def _without_reference(run: Path, as_json: bool) -> int:
+    from trihedron.pipeline.record.reader import Recording
     from trihedron.tools.quality import quality_of_run, quality_of_truth
 
-    figures, truth = quality_of_run(run).to_dict(), quality_of_truth(run)
-    columns = {"value": figures} | ({"by the ground truth": truth.to_dict()} if truth is not None else {})
+    recording = Recording(run)
+    figures, quality = quality_of_run(recording).to_dict(), quality_of_truth(recording)
+    truth = quality.to_dict() if quality is not None else None
+    columns = {"value": figures, **({"by the ground truth": truth} if truth else {})}
     if as_json:
-        print(json.dumps(figures | ({"truth": truth.to_dict()} if truth is not None else {}), indent=2))
+        print(json.dumps({**figures, **({"truth": truth} if truth else {})}, indent=2))
         return 0
     rows = [["figure without truth", *columns]]
     for name in figures:

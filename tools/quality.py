@@ -20,7 +20,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import lru_cache
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -87,25 +86,21 @@ class Parts:
     members: list[Rows]
 
 
-def quality_of_run(run: Path) -> Quality:
-    """Judge a run folder or recording. Raises DataError where its frames are gone, or fewer than two are posed."""
+def quality_of_run(recording: Recording) -> Quality:
+    """Judge the recording of a run. Raises DataError where its frames are gone, or fewer than two are posed."""
     from trihedron.pipeline.core.types import Pose
-    from trihedron.pipeline.record.reader import Recording
     from trihedron.pipeline.run.stated_sigma import stated_sigma
 
-    recording = Recording(run)
     frames, _, count = _posed_frames(recording)
     stated = stated_sigma([pose for pose in recording.values("pose") if isinstance(pose, Pose)] if "pose" in recording.topics else [], [])
     return quality_of(frames, count, stated.median_m if stated is not None else None)
 
 
-def quality_of_truth(run: Path) -> Quality | None:
+def quality_of_truth(recording: Recording) -> Quality | None:
     """Judge the ground truth of a run by the same frames; None where fewer than two of them have one. Raises as `quality_of_run`."""
-    from trihedron.pipeline.record.reader import Recording
     from trihedron.pipeline.record.trajectories import attached_truth
     from trihedron.pipeline.run.metrics import associate
 
-    recording = Recording(run)
     truth = attached_truth(recording.attachments, str(recording.path))
     if truth is None:
         return None

@@ -167,8 +167,8 @@ class Table(Described):
 
     def _copy(self, name: str, capacity: int, freed: frozenset[int]) -> _Buffer:
         """Copy a column into memory of its own, but for the chunks that are freed. Where there are such they take no memory: zeros that nobody wrote.
-        A column without is copied into memory that the process returned, since pages of the system cost ten times as much as the copy; not a large
-        one, which would leave holes."""
+        A column without is copied into memory that the process returned, since pages of the system cost more than the copy; not a large one, which
+        would leave holes."""
         column, known = self.schema[name], self._buffers[name].rows
         shape = capacity, *column.shape
         rows = _zeros(shape, column.element) if freed or capacity * column.row_bytes > LARGE else np.empty(shape, column.element)

@@ -14,7 +14,7 @@ value is constructed, and the arrays become read-only.
 from __future__ import annotations
 
 from collections.abc import Hashable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import Annotated, Any, ClassVar
 
@@ -437,7 +437,7 @@ class CalibrationSigmas:
     depth_scale: Annotated[float, Within(0.0, 1.0)] = 0.005  # of all depths alike, relative
 
 
-EXACT_CALIBRATION = CalibrationSigmas(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+EXACT_CALIBRATION = CalibrationSigmas(*(0.0,) * len(fields(CalibrationSigmas)))
 
 
 @dataclass(frozen=True)

@@ -61,8 +61,8 @@ def with_calibration(pose: Pose, previous: Pose, solution: PoseSolution, problem
 def contradicted_calibration(pose: Pose) -> str:
     """Return why the residuals so far contradict the stated calibration; empty where they do not.
 
-    The parameters are independent and have standard deviations of 1 in the units of `calibration_scales`; their root mean square so far is 0.2 to 1.4
-    in sequences of four cameras and ten simulated ones, 3.9 where depth is not registered to colour, 15 with a focal length off by a fifth."""
+    The parameters are independent and have standard deviations of 1 in the units of `calibration_scales`; their root mean square so far is at most
+    1.4 in sequences of four cameras and ten simulated ones, 3.5 where depth is not registered to colour, 15 with a focal length off by a fifth."""
     size = np.sqrt(np.diag(calibration_moment(pose.calibration_information, pose.calibration_score)))
     if np.sqrt((size * size).mean()) <= CALIBRATION_SIGMAS:
         return ""

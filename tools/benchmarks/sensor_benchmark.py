@@ -98,9 +98,10 @@ def words_of(sensor: str, room: str, seed: int, length: int) -> list[str]:
 
 
 def _quality(run: Path) -> dict[str, float]:
+    from trihedron.pipeline.record.reader import Recording
     from trihedron.tools.quality import quality_of_run
 
-    return quality_of_run(run).to_dict()
+    return quality_of_run(Recording(run)).to_dict()
 
 
 def correlations(found: Sequence[tuple[dict[str, Any], float | None]]) -> str:
