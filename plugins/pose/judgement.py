@@ -122,10 +122,12 @@ def judge_by_run(pose: Pose) -> Pose:
 
 
 def disagreement(previous: Pose, inliers: InlierStatistics) -> float:
-    """Return the moving average of the share of matched points that do not agree; a frame with few of them leaves it as it is."""
+    """Return the moving average of the share of matched points that do not agree. The first frame with any begins it (an average that begins at zero
+    takes a contradiction from the first frame on for agreement); a frame with few matched points leaves it as it is."""
     if inliers.matched[0] < DETAILED:
         return previous.disagreement
-    return previous.disagreement + (1.0 - inliers.inliers[0] / inliers.matched[0] - previous.disagreement) / DISAGREEMENT_FRAMES
+    share = 1.0 - inliers.inliers[0] / inliers.matched[0]
+    return previous.disagreement + (share - previous.disagreement) / DISAGREEMENT_FRAMES if previous.disagreement else share
 
 
 def since_loss(pose: Pose, previous: Pose) -> Pose:
