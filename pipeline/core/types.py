@@ -313,9 +313,10 @@ class Pose(Value):
     first; others have a world of their own until they are merged), `unrecognised` the number of frames of a lost camera without relocalisation.
 
     `covariance` is that of the pose in the world: `noise_scale` times the covariance relative to the landmarks near it, plus `map_covariance`, that
-    of these landmarks' common pose in the world, by drift and by an imperfect calibration. `noise_scale` is the variance of the residuals relative to
-    the stated one. `keyframe_covariance` is that of the keyframes which created these landmarks where it is much more than the pose's own, else zero:
-    landmarks made from this pose count it in their weights.
+    of these landmarks' common pose in the world, by drift and by an imperfect calibration; where the image repeats an earlier one, also how far the
+    camera may have moved since. `noise_scale` is the variance of the residuals relative to the stated one. `keyframe_covariance` is that of the
+    keyframes which created these landmarks where it is much more than the pose's own, else zero: landmarks made from this pose count it in their
+    weights.
 
     `repeats` is the number of images in a row, up to this one, that repeat the one before bit for bit; `disagreement` the share of the matched points
     that do not agree with their frame's pose, as a moving average over ten frames. `lost_from` is the number of the first frame of the latest loss, 0

@@ -38,10 +38,13 @@ class KeyframeOptions:
 
 
 def needs_keyframe(options: KeyframeOptions, frame: Frame, pose: Pose, planes: Planes, matches: Matches | None, map: Map) -> bool:
-    """Return True if this frame shows enough that is new: the view has changed, few landmarks are tracked, or a large plane is not in the map."""
+    """Return True if this frame shows enough that is new: the view has changed, few landmarks are tracked, or a large plane is not in the map. An
+    image that repeats the one before shows nothing new."""
     keyframes, newest = map.keyframes, newest_keyframes(map, 1).tolist()
     if not newest or keyframes.row("submap", newest[0]) != pose.submap:
         return True
+    if pose.repeats:
+        return False
     frames = frame.index - int(keyframes.row("index", newest[0]))
     spans = [keyframes.row(kind.span_column, newest[0]).tolist() for kind in WEIGHTS]
     tracked_share = _weighted_total(pose.inliers.tolist()) / max(_weighted_total([end - begin for begin, end in spans]), 1)

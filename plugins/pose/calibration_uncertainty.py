@@ -29,10 +29,14 @@ LONGEST_S = 1.0  # between two frames that a velocity is taken from
 
 
 def with_velocity(pose: Pose, previous: Pose, map: Map) -> Pose:
-    """Give a pose the velocity of the camera, and that of its reference keyframe: the mean of the motions to it and from it."""
+    """Give a pose the velocity of the camera, and that of its reference keyframe: the mean of the motions to it and from it. An image that repeats
+    the one before has that one's."""
     seconds = 1e-9 * (pose.stamp_ns - previous.stamp_ns)
     known = previous.status != LOST and 0.0 < seconds <= LONGEST_S
-    twist = log_se3(matmul(invert(previous.T_world_camera), pose.T_world_camera)) / seconds if known else np.zeros(6)
+    if pose.repeats:
+        twist = previous.twist
+    else:
+        twist = log_se3(matmul(invert(previous.T_world_camera), pose.T_world_camera)) / seconds if known else np.zeros(6)
     if not 0 <= pose.reference < len(map.keyframes):
         return replace(pose, twist=twist)
     if int(map.keyframes.row("index", pose.reference)) == previous.index:

@@ -13,8 +13,8 @@ TABLES = ("keyframes", "points", "lines", "planes", "point_observations", "line_
 KNOWN = (("point_information", "point_ids", (), 1e5), ("line_information", "line_ids", (2,), 1e4), ("plane_covariance", "plane_ids", (), 1e-5))
 
 
-def pose_of(T, index, status="ok", inliers=(0, 0, 0)):
-    return Pose(index, index * 33_000_000, T, np.eye(6) * 1e-10, T, -1, np.array(inliers, np.int32), 0, status, "")
+def pose_of(T, index, status="ok", inliers=(0, 0, 0), **more):
+    return Pose(index, index * 33_000_000, T, np.eye(6) * 1e-10, T, -1, np.array(inliers, np.int32), 0, status, "", **more)
 
 
 def step(stage, world, map, index, at=None, features=None, bundle=None, loop=None, recognised=None, frame=None, **pose):

@@ -46,6 +46,7 @@ def test_nothing_is_returned_when_nothing_changes():
     assert step(Covisibility(), world, map, 1, at=20, **seen) is None  # too soon after the last keyframe
     assert step(Covisibility(), world, map, 9, at=20, status="lost", **seen) is None
     assert step(Covisibility(), world, map, 200, at=0.0, **seen) is None  # a camera at rest
+    assert step(Covisibility(), world, map, 9, at=20, repeats=1, **seen) is None  # an image that repeats the one before
     assert NoMap()(pose_of(np.eye(4), 0)) is None
 
 

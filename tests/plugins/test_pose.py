@@ -327,8 +327,8 @@ def test_a_sub_map_that_does_not_show_the_frame_is_left():
     assert pose.reason.startswith("sub-map 1 does not show what the frame does: only ")
 
 
-def test_images_that_repeat_twice_are_degraded():
-    """The first repetition is one of a Kinect, the second is not; whatever differs ends it."""
+def repeating(steps):
+    """Poses of frames 33 ms apart that show one image; with True as new, with False as one that repeats the one before."""
     world, map = World(), first_map(World())
     features = world.features(camera_at(5), 5)
     keypoints, _, planes = features
@@ -346,11 +346,31 @@ def test_images_that_repeat_twice_are_degraded():
         coefficients=planes.coefficients,
         plane_covariance=np.zeros((len(planes.coefficients), 3, 3)),
     )
-    pose, statuses = pose_of(camera_at(4), 4), []
-    for given in (same, same, same, tracks, same):
-        pose = Refine()(world.frame(5).camera, rotation, translation, given, matches, *features, pose, map, None)
-        statuses.append((pose.repeats, pose.status))
+    pose, poses = pose_of(camera_at(4), 4), []
+    for number, new in enumerate(steps):
+        timed = dataclasses.replace(rotation, stamp_ns=pose.stamp_ns + 33_000_000, index=5 + number)
+        pose = Refine()(world.frame(5).camera, timed, translation, tracks if new else same, matches, *features, pose, map, None)
+        poses.append(pose)
+    return poses
+
+
+def test_images_that_repeat_twice_are_degraded():
+    """The first repetition is one of a Kinect, the second is not; whatever differs ends it."""
+    statuses = [(pose.repeats, pose.status) for pose in repeating([False, False, False, True, False])]
     assert statuses == [(1, "ok"), (2, "degraded"), (3, "degraded"), (0, "ok"), (1, "ok")]
+
+
+def test_a_repeated_image_is_no_measurement():
+    """Of the camera's motion since it was taken nothing is known but that it went on about as it did; of its calibration nothing new."""
+    first, *repeated = repeating([True, False, False, False])
+    speed, rate = (np.linalg.norm(part) for part in np.split(first.twist, 2))
+    assert speed > 0.1
+    for count, pose in enumerate(repeated, 1):
+        assert np.array_equal(pose.twist, first.twist)
+        assert np.array_equal(pose.calibration_information, first.calibration_information)
+        seconds, grown = 0.033 * count, pose.covariance - first.covariance
+        sigmas = np.sqrt([np.trace(grown[:3, :3]), np.trace(grown[3:, 3:])])
+        assert sigmas == pytest.approx([seconds * np.hypot(speed, 0.2), seconds * np.hypot(rate, 0.2)], rel=0.02)
 
 
 def test_the_same_input_gives_the_same_bytes():
