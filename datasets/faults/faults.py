@@ -37,7 +37,7 @@ class Cover(Enum):
     random = "random"
 
 
-EACH, ALL, SHUFFLED = 5, 6, 9  # streams of random numbers: one a frame, one for all frames, one of the order of colour
+EACH, ALL, SHUFFLED, GRAIN = 5, 6, 9, 10  # streams of random numbers: one a frame, one for all frames, of the order of colour, of its noise
 
 
 @register("dataset", "faults")
@@ -69,12 +69,14 @@ class Faults:
     focal_times: PositiveFloat = 1.0  # the stated focal lengths are wrong by this factor
     resize: PositiveFloat = 1.0  # resolution, times what it was; the stated camera is right
     gamma: PositiveFloat = 1.0  # of colour
+    color_noise: NonNegativeFloat = 0.0  # standard deviation, grey levels; also of colour that is frozen
     exposure_ms: NonNegativeFloat = 0.0  # motion blur of colour
     readout_ms: NonNegativeFloat = 0.0  # from the first row to the last: rolling shutter
     moving: Share = 0.0  # share of the image covered by what moves
     reflecting: Share = 0.0  # share of the image with mirrors and glass
     seed: NonNegativeInt = 0
     frozen: Covered = Covered.both  # both | color | depth: the images that freeze
+    frozen_share: Share = 1.0  # of them, from the left, that freezes
     shuffle: bool = False  # colour is that of any frame, at random
     mirror: bool = False  # colour is mirrored left to right, depth is not
     join: NonNegativeInt = 0  # frame from which on the images are of another recording; 0 = none
@@ -98,9 +100,10 @@ class Faults:
         timed: Frame | None = frame if shown == number else self._inner(number)
         if frame is None or timed is None:
             return None
-        if shown != number and self.frozen is not Covered.both:
-            frozen = {"color": frame.color} if self.frozen is Covered.color else {"depth_m": frame.depth_m}
-            shown, frame = number, replace(timed, **frozen)
+        if shown != number and (self.frozen is not Covered.both or self.frozen_share < 1.0):
+            color = timed.color if self.frozen is Covered.depth else spoil.partly(frame.color, timed.color, self.frozen_share)
+            depth = timed.depth_m if self.frozen is Covered.color else spoil.partly(frame.depth_m, timed.depth_m, self.frozen_share)
+            shown, frame = number, replace(timed, color=color, depth_m=depth)
         if number % self.depth_every and (slow := self._inner(number - number % self.depth_every)) is not None:
             frame = replace(frame, depth_m=slow.depth_m)
         color, depth, camera = self._cover_images(number, *self._spoilt(shown, frame))
@@ -143,6 +146,7 @@ class Faults:
             color = other.color
         color = np.ascontiguousarray(color[:, ::-1]) if self.mirror else color
         color = spoil.with_gamma(color, self.gamma) if self.gamma != 1.0 else color
+        color = spoil.with_color_noise(color, self.color_noise, self._rng(GRAIN, number)) if self.color_noise else color
         if self.resize != 1.0:
             color, depth, camera = spoil.resize_frame(color, depth, camera, self.resize)
         if self.depth_resize != 1.0:

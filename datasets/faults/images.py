@@ -29,6 +29,18 @@ def with_gamma(color: U8, gamma: float) -> U8:
     return np.asarray(cv2.LUT(color, np.rint(255.0 * (np.arange(256) / 255.0) ** gamma).astype(np.uint8)), np.uint8)
 
 
+def with_color_noise(color: U8, sigma: float, rng: np.random.Generator) -> U8:
+    """White noise of so many grey levels (standard deviation)."""
+    noise = np.float32(sigma) * rng.standard_normal(color.shape, dtype=np.float32)
+    return np.clip(np.rint(color + noise), 0.0, 255.0).astype(np.uint8)
+
+
+def partly(image: NDArray[Any], other: NDArray[Any], share: float) -> NDArray[Any]:
+    """The first image in `share` of the columns, from the left, and the other one in the rest."""
+    columns = round(share * image.shape[1])
+    return np.concatenate([image[:, :columns], other[:, columns:]], axis=1)
+
+
 def noisy(depth_m: F32, times: float, camera: Camera, rng: np.random.Generator) -> F32:
     """White noise of `times` the standard deviation that the camera states of its depth."""
     noise = np.float32(times) * camera.depth_noise.sigma_m(depth_m).astype(np.float32) * rng.standard_normal(depth_m.shape, dtype=np.float32)

@@ -302,6 +302,7 @@ OK, DEGRADED, LOST = "ok", "degraded", "lost"
 
 
 CALIBRATION = 12  # parameters of a camera's calibration whose errors a pose's covariance counts
+USUAL_TURN_DIFFERENCE = np.pi / 600.0  # 0.3°: what planes turn by more or less than the camera from frame to frame, before that is measured
 
 
 @dataclass(frozen=True)
@@ -321,14 +322,15 @@ class Pose(Value):
     `repeats` is the number of images in a row, up to this one, that repeat the one before bit for bit; `disagreement` the share of the matched points
     that do not agree with their frame's pose, as a moving average over ten frames. `lost_from` is the number of the first frame of the latest loss, 0
     for none, and `missing` the share of the points mapped before it that should have been matched since the camera was found again and were not, as a
-    moving average over a thousand of them.
+    moving average over a thousand of them. `turn_difference` is the rotation (rad, camera frame) by which planes turned more than the pose, as a
+    moving average over ten frames, and `usual_turn_difference` its usual size in one frame, 0.3° before the first.
 
     Five fields are what the pose's error owes to an imperfect calibration (`plugins.shared.calibration_error`, which defines the parameters and their
     units): `sensitivity` is the derivative of the error by them, `calibration_information` and `calibration_score` the information of the residuals
     on them so far. `twist` is the camera's velocity (m/s, rad/s) in its own frame, `reference_twist` that of the reference keyframe.
     `depth_scale_sigma` is the relative standard deviation of the scale of all depths, of which residuals tell nothing."""
 
-    version: ClassVar[int] = 5
+    version: ClassVar[int] = 6
 
     T_world_camera: Annotated[F64, Shape(4, 4), Rotations()]
     covariance: Annotated[F64, Shape(6, 6), Finite()]
@@ -355,6 +357,8 @@ class Pose(Value):
     lost_from: Annotated[int, Within(0, 2**31)] = 0
     missing: Annotated[float, Within(0.0, 1.0)] = 0.0
     depth_scale_sigma: Annotated[float, Within(0.0, 1.0)] = 0.0
+    turn_difference: Annotated[F64, Shape(3), Finite()] = field(default_factory=lambda: np.zeros(3))
+    usual_turn_difference: Annotated[float, Within(0.0, np.pi)] = USUAL_TURN_DIFFERENCE
 
     @property
     def local_covariance(self) -> F64:

@@ -16,7 +16,7 @@ from mcap_protobuf.schema import build_file_descriptor_set
 
 from trihedron.pipeline.core.constraints import Columns
 from trihedron.pipeline.core.errors import RecordingError, printable
-from trihedron.pipeline.core.types import CALIBRATION, PROPOSALS, Frame
+from trihedron.pipeline.core.types import CALIBRATION, PROPOSALS, USUAL_TURN_DIFFERENCE, Frame
 from trihedron.pipeline.record.codec import (
     FORMAT,
     FRAMES_TOPIC,
@@ -45,6 +45,7 @@ ADDED_FIELDS: dict[tuple[str, int], dict[str, Any]] = {  # type and older versio
         "calibration_score": np.zeros(CALIBRATION),
     },
     ("Pose", 4): {"keyframe_covariance": np.zeros((6, 6))},
+    ("Pose", 5): {"turn_difference": np.zeros(3), "usual_turn_difference": USUAL_TURN_DIFFERENCE},
     ("Map", 5): {"loop_closed": 0},
     ("Building", 1): {"doubts": np.zeros((0, 3))},
 }

@@ -5,8 +5,8 @@ status, with its figures:
 
 - **Information**: landmarks of the map determine all six directions, and there are enough of them.
 - **Agreement**: more matches agree with the pose than would by chance, and most of them did over ten frames.
-- **Contradiction**: what disagrees is not explained by something that moves (`dynamic_objects.py` asks static matches, and planes), and the residuals
-  so far do not contradict the camera's calibration (`calibration_uncertainty.py`).
+- **Contradiction**: what disagrees is not explained by something that moves (`dynamic_objects.py` asks static matches, and planes), planes turn as
+  the camera does (`plane_turns.py`), and the residuals so far do not contradict the camera's calibration (`calibration_uncertainty.py`).
 - **Continuity**: the rotation was measured, and the frame continues the previous one, or the map knows its details: of a place that is built alike,
   walls and lines agree, and points do not. A camera that was found again keeps finding what was mapped before it was lost; in a room like the one it
   was taken to be in, it does until it leaves.
@@ -29,6 +29,7 @@ from trihedron.plugins.mapping.submaps import is_elsewhere
 from trihedron.plugins.pose.calibration_uncertainty import contradicted_calibration
 from trihedron.plugins.pose.dynamic_objects import MovingOptions, Selection, status_with_static
 from trihedron.plugins.pose.map_alignment import InlierStatistics, MapAlignment, TrackingStatus
+from trihedron.plugins.shared.plane_turns import contradicting_turn
 from trihedron.plugins.shared.pose_optimizer import PoseSolution
 from trihedron.plugins.shared.residuals_kernels import NEAR_M
 
@@ -115,9 +116,10 @@ def status_by_images(status: TrackingStatus, evidence: Evidence, repeats: int) -
 
 
 def judge_by_run(pose: Pose) -> Pose:
-    """Degrade an ok pose that contradicts the run so far: its matched points have disagreed for ten frames, what was mapped before the latest loss is
-    not there, or the residuals contradict the calibration."""
-    reason = (_lasting_disagreement(pose) or _found_elsewhere(pose) or contradicted_calibration(pose)) if pose.status == OK else ""
+    """Degrade an ok pose that contradicts the run so far: its matched points have disagreed for ten frames, planes turned otherwise, what was mapped
+    before the latest loss is not there, or the residuals contradict the calibration."""
+    tests = _lasting_disagreement, contradicting_turn, _found_elsewhere, contradicted_calibration
+    reason = next(filter(None, (test(pose) for test in tests)), "") if pose.status == OK else ""
     return replace(pose, status=DEGRADED, reason=reason) if reason else pose
 
 

@@ -44,6 +44,7 @@ from trihedron.plugins.pose.judgement import (
 )
 from trihedron.plugins.pose.map_alignment import MapAlignment
 from trihedron.plugins.pose.world_uncertainty import in_world, keyframe_covariance, propagate_world_covariance
+from trihedron.plugins.shared.plane_turns import with_turn_difference
 from trihedron.plugins.shared.pose_optimizer import PoseSolution
 
 EYE = np.eye(3)
@@ -109,6 +110,7 @@ class Refine(JudgementOptions):
         stamps = rotation.index, rotation.stamp_ns
         pose = Pose(*stamps, T, solution.covariance, T_reference_camera, reference, counts, held, status.status, status.reason, submap)
         pose = in_world(replace(pose, repeats=repeats, keyframe_covariance=shared), previous, solution, problem)
+        pose = with_turn_difference(pose, previous, tracks, planes)
         missing = missing_points(previous, submap, problem, T)
         return judge_by_run(replace(pose, disagreement=disagreement(previous, inliers), lost_from=previous.lost_from, missing=missing))
 

@@ -59,6 +59,26 @@ def test_one_image_freezes_and_the_other_goes_on(frozen):
         assert np.array_equal(seen.depth_m, plain[position if frozen is Covered.color else still].depth_m)
 
 
+@pytest.mark.parametrize("frozen", list(Covered))
+def test_a_part_of_an_image_freezes(frozen):
+    """The left quarter, 16 columns."""
+    (plain, _), faults = still_frames(0, 6), Faults("0:6", "synthetic", SMALL, freeze="2:5", frozen=frozen, frozen_share=0.25)
+    seen, now, then = faults(4), plain[4], plain[2]
+    for name, froze in (("color", frozen is not Covered.depth), ("depth_m", frozen is not Covered.color)):
+        image, new, old = (getattr(frame, name) for frame in (seen, now, then))
+        assert np.array_equal(image[:, 16:], new[:, 16:]) and np.array_equal(image[:, :16], (old if froze else new)[:, :16])
+
+
+def test_colour_that_is_frozen_has_new_noise():
+    (plain, _), faults = still_frames(0, 6), Faults("0:6", "synthetic", SMALL, freeze="2:5", frozen=Covered.color, color_noise=2.0)
+    third, fourth = faults(3).color.astype(int), faults(4).color.astype(int)
+    inner = (plain[2].color > 20) & (plain[2].color < 235)
+    for image in (third, fourth):
+        assert 1.9 < (image - plain[2].color)[inner].std() < 2.2  # with that of rounding
+    assert 2.6 < (third - fourth)[inner].std() < 3.1
+    assert np.array_equal(faults(4).color, fourth)
+
+
 def test_a_stride_is_of_the_frames_as_they_arrive_and_a_cover_of_those_underneath():
     (plain, _), faults = still_frames(0, 12), Faults("1::4", "synthetic", {**SMALL, "length": 12}, cover="0:12:3", drop="2:3")
     seen = [faults(position) for position in range(len(faults))]

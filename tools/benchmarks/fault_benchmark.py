@@ -23,6 +23,8 @@ CASES = {  # name -> what the data set is given
     "frozen_depth": ("dataset.freeze=30:60", "dataset.frozen=depth"),
     "frozen_color": ("dataset.freeze=30:60", "dataset.frozen=color"),
     "frozen": ("dataset.freeze=30:60",),
+    "frozen_color_with_noise": ("dataset.freeze=30:60", "dataset.frozen=color", "dataset.color_noise=2"),
+    "partly_frozen_color": ("dataset.freeze=30:60", "dataset.frozen=color", "dataset.frozen_share=0.7"),
     "shuffled_color": ("dataset.shuffle=true",),
     "random_color": ("dataset.cover=30:60", "dataset.covered=color", "dataset.cover_with=random"),
     "black_color": ("dataset.cover=30:60", "dataset.covered=color"),
