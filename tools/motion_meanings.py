@@ -24,7 +24,7 @@ RIGHT_M, RIGHT_DEG = 0.05, 2.0  # of a pose after a few frames
 
 
 def ids_exist(call: Call) -> Iterator[Figure]:
-    """Rows and ids name what is there. Raises RecordingError, which says where they do not."""
+    """Rows and ids name what is there. Raises RecordingError, which names the place where they do not."""
     rows = ("keypoints", "segments", "planes")
     features = {name: call.topics.get(name) for name in rows} | {f"previous_{name}": call.previous.get(name) for name in rows}
     check_together({**features, "map": call.map, "value": call.value}, "value", {})

@@ -41,7 +41,7 @@ OPEN3D_NEEDS = (  # the loader names only the first that is missing
 
 
 def main() -> int:
-    """Import each module in a process of its own; print one line for each that does not load, or one that says that all do.
+    """Import each module in a process of its own; print one line for each that does not load, or one where all do.
 
     Returns 0 when all load, 1 when a required one does not, 3 when only optional ones do not."""
     code = 0

@@ -756,7 +756,7 @@ class Building(Value):
     of OPENING_KINDS, and the rooms it joins (-1 = none). `furniture` are ids of the planes of the map that are none of the building's own. Rows of
     `support` are (row of ELEMENTS, the element, row of SUPPORTS, id or number). `note` names what is missing. Rows of
     `doubts` are (room, change, probability): by how much its area would change, m², if something is otherwise than the plan has it, beside what
-    `area_variance` says of its walls. `edits` are corrections by hand, with names and uses of elements, as JSON; empty without any."""
+    `area_variance` counts of its walls. `edits` are corrections by hand, with names and uses of elements, as JSON; empty without any."""
 
     version: ClassVar[int] = 2
 

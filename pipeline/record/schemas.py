@@ -37,7 +37,7 @@ _HEADER_COMMENTS = ("name of the type", "of the type's fields", "number of the f
 
 CONVENTIONS = {  # of all channels, in their metadata
     "ids": "index: the frame's number in the data set; an id of a keyframe or landmark is its row in the map's table, for good",
-    "units": "metres, radians, pixels, unless the end of a field's name says another: _deg, _ns, _s, _ms, _mb; log time: the frame's stamp",
+    "units": "metres, radians, pixels, unless the end of a field's name is another: _deg, _ns, _s, _ms, _mb; log time: the frame's stamp",
     "frames": "camera: x right, y down, z forward; world: the camera of the first frame; T_a_b maps points of b into a: p_a = T_a_b p_b",
 }
 

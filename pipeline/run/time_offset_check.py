@@ -26,7 +26,7 @@ MIN_OFFSET_S, MIN_RATIO, MIN_T = 0.025, 1.2, 2.5  # of the best offset: of the s
 class TimeOffsetCheck:
     """Compare where depth jumps with where colour does, as it is and with the camera moved on by its velocity for a time.
 
-    A shift of depth that is common to all frames is free: depth that is not registered is another fault, and motion in one direction alone tells
+    A shift of depth that is common to all frames is free: depth that is not registered is another fault, and motion in one direction alone shows
     nothing. `_scores` holds one (offsets, rows, columns) mean colour gradient at the near side of the depth edges for each judged frame."""
 
     _scores: list[F64] = field(default_factory=list)

@@ -35,7 +35,7 @@ class Progress:
     """Progress of compilation on standard error: a bar on a terminal, else a line every few seconds. Nothing is printed before the first function."""
 
     def __init__(self, what: str = NEW, total: int | None = None) -> None:
-        """`what` says which functions are compiled, `total` how many, about."""
+        """`what` names the functions that are compiled, `total` is how many, about."""
         self.count, self._total, self._message = 0, total, COMPILING.format(what)
         self._bar: tqdm[None] | None = None
         self._began = self._printed = 0.0

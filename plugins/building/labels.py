@@ -171,7 +171,7 @@ def title_of(building: Building, element: str, number: int) -> str:
 
 
 def area_text(building: Building, room: int) -> str:
-    """Return the area of a room: with its standard deviation where that tells all, else with its 95 % interval; "seen" where its walls were not seen
+    """Return the area of a room: with its standard deviation where that is enough, else with its 95 % interval; "seen" where its walls were not seen
     all round."""
     area, sigma, (low, high) = float(building.areas_m2[room]), area_sigma(building, room), area_interval(building, room)
     if building.closed[room] and abs(low + high - 2.0 * area) < LOPSIDED * (high - low):

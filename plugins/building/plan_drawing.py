@@ -40,7 +40,7 @@ ALONG = (0.5, 0.35, 0.65, 0.2, 0.8)  # shares of an edge where its length is wri
 
 
 def draw_plan(building: Building, per_m: float, name: str = "", scale: str = "") -> Sheet:
-    """Draw all storeys at a scale, points of paper per metre. `name` is that of the run, `scale` what the title says of the scale."""
+    """Draw all storeys at a scale, points of paper per metre. `name` is that of the run, `scale` the scale as the title has it."""
     listed: list[str] = []
     groups: list[Group] = []
     x = 0.0

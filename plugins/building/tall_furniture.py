@@ -1,4 +1,4 @@
-"""Tall furniture, told from walls: the probability that a stretch of a face is a wall, by the heights at which views read it and what is behind."""
+"""Tall furniture as against walls: the probability that a stretch of a face is a wall, by the heights at which views read it and what is behind."""
 
 from __future__ import annotations
 

@@ -268,7 +268,7 @@ class Building:
 
         Args:
             path: the file; it is overwritten.
-            name: what the title says that it is a plan of.
+            name: what it is a plan of, for its title.
 
         Returns:
             The path.
@@ -285,7 +285,7 @@ class Building:
 
         Args:
             path: the file; it is overwritten.
-            name: what the title says that it is a plan of.
+            name: what it is a plan of, for its title.
 
         Returns:
             The path.

@@ -62,8 +62,8 @@ class Verdict:
     `before`, `after`: the figure of the first and the second, means over the recordings. `pieces`: the number of segments of the one recording
     (blocks), or of recordings. `error`: standard error of the difference, with `pieces - 1` degrees of freedom. `low`, `high`: ends of the 95 %
     interval. `corrected`: p-value after Holm's correction. `effect`: the difference by its standard deviation from piece to piece. `needed`: how many
-    recordings of this length more would show a difference of 5 % of `before` in 8 of 10 studies. `answer`: the verdict in words. What cannot be told
-    is None."""
+    recordings of this length more would show a difference of 5 % of `before` in 8 of 10 studies. `answer`: the verdict in words. What is not
+    known is None."""
 
     first: str
     second: str
