@@ -19,7 +19,7 @@ TURN_FRAMES, USUAL_FRAMES = 10, 30  # that the difference, and its usual size in
 LARGEST = 2.0  # times the usual size that a frame counts at most
 NORMAL_DEG = 0.2  # added to a plane's own standard deviation: depth has errors that its noise does not show
 PRIOR_DEG = 1.0  # standard deviation of the difference in a frame, before it is measured
-MOST_SIGMAS = 4.0  # of the mean; at most 3.0 of 75 simulated sensors and of sequences of four cameras
+MOST_SIGMAS = 4.0  # of the mean; at most 3.6 of 75 simulated sensors and of sequences of four cameras
 LEAST_DEG = 1.0  # over ten frames, that is worth a doubt: less is a bias of depth
 TINY = 1e-9
 
@@ -35,7 +35,8 @@ def with_turn_difference(pose: Pose, previous: Pose, tracks: Tracks | None, plan
         variance = covariances[:, 0, 0] + covariances[:, 1, 1] + math.radians(NORMAL_DEG) ** 2
         R = np.ascontiguousarray(matmul(invert(previous.T_world_camera), pose.T_world_camera)[:3, :3])
         before, normals = (np.ascontiguousarray(coefficients[:, :3]) for coefficients in (tracks.coefficients, planes.coefficients[now]))
-        difference = rotation_of_normals(before, normals, variance, R, math.radians(PRIOR_DEG))
+        importance = np.sqrt(planes.pixels[now] / planes.pixels[now].mean())  # what moves is seldom large
+        difference = rotation_of_normals(before, normals, variance, importance, R, math.radians(PRIOR_DEG))
         mean = mean + (difference - mean) / TURN_FRAMES
         usual += (min(math.hypot(*difference.tolist()), LARGEST * usual) - usual) / USUAL_FRAMES
     return replace(pose, turn_difference=mean, usual_turn_difference=usual)

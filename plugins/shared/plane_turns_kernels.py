@@ -9,13 +9,14 @@ from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.linalg_kernels import solve_positive
 from trihedron.pipeline.core.types import F64
 
-ROUNDS = 6  # of reweighted least squares
-CAUCHY2 = 4.0  # squared residual, in standard deviations, that halves a plane's weight
+ROUNDS = 12  # of reweighted least squares
+LEAST_RESIDUAL = 0.5  # standard deviations, below which residuals count squared, beyond by their size
 
 
 @kernel
-def rotation_of_normals(before: F64, now: F64, variance: F64, R: F64, prior: float) -> F64:
-    """Small rotation vector (3,) from the normals (n, 3) `before`, rotated by the transpose of R (3, 3), to those of `now`, by robust least squares.
+def rotation_of_normals(before: F64, now: F64, variance: F64, importance: F64, R: F64, prior: float) -> F64:
+    """Small rotation vector (3,) from the normals (n, 3) `before`, rotated by the transpose of R (3, 3), to those of `now`, that has the least sum of
+    residuals, each times the plane's `importance` (n,).
 
     `variance` (n,) is that of each normal's direction (rad²), `prior` the standard deviation (rad) that shrinks what no plane shows towards zero."""
     n = len(before)
@@ -31,7 +32,7 @@ def rotation_of_normals(before: F64, now: F64, variance: F64, R: F64, prior: flo
         H[:] = np.eye(3) / (prior * prior)
         g[:] = 0.0
         for i in range(n):
-            w, p, d = weights[i] / variance[i], predicted[i], difference[i]
+            w, p, d = weights[i] * importance[i] / variance[i], predicted[i], difference[i]
             squared = p[0] * p[0] + p[1] * p[1] + p[2] * p[2]
             for a in range(3):
                 for b in range(3):
@@ -45,5 +46,5 @@ def rotation_of_normals(before: F64, now: F64, variance: F64, R: F64, prior: flo
             x = d[0] - (r[1] * p[2] - r[2] * p[1])
             y = d[1] - (r[2] * p[0] - r[0] * p[2])
             z = d[2] - (r[0] * p[1] - r[1] * p[0])
-            weights[i] = 1.0 / (1.0 + (x * x + y * y + z * z) / (CAUCHY2 * variance[i]))
+            weights[i] = 1.0 / max(np.sqrt((x * x + y * y + z * z) / variance[i]), LEAST_RESIDUAL)
     return r

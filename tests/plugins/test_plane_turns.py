@@ -23,7 +23,7 @@ def shown(vector, before=NORMALS, wrong=None):
     if wrong is not None:
         now[wrong] = now[wrong] @ Rotation.from_rotvec([0.0, 0.1, 0.1]).as_matrix()
     now[1::2] *= -1.0  # a normal's sign is that of its own frame
-    return rotation_of_normals(before, np.ascontiguousarray(now), np.full(len(before), VARIANCE), TURN, PRIOR)
+    return rotation_of_normals(before, np.ascontiguousarray(now), np.full(len(before), VARIANCE), np.ones(len(before)), TURN, PRIOR)
 
 
 @pytest.mark.parametrize("degrees", [(0.4, 0.0, 0.0), (0.1, -0.3, 0.2), (0.0, 0.0, 0.0)])
@@ -49,7 +49,7 @@ def walked(frames, planes_deg, camera_deg, frozen_at=1000, **frame):
         T[:3, :3] = Rotation.from_euler("y", min(index, frozen_at) * camera_deg, degrees=True).as_matrix()
         covariance = np.tile(np.diag([VARIANCE, VARIANCE, 1e-6]), (len(NORMALS), 1, 1))
         tracks = SimpleNamespace(previous_index=index - 1, planes=np.stack([np.arange(4)] * 2, 1), coefficients=before, plane_covariance=covariance)
-        planes = SimpleNamespace(coefficients=now, covariance=covariance)
+        planes = SimpleNamespace(coefficients=now, covariance=covariance, pixels=np.full(len(NORMALS), 1000, np.int32))
         given = {"tracks": tracks, "planes": planes, **frame}
         pose = with_turn_difference(dataclasses.replace(pose, index=index, T_world_camera=T), pose, **given)
     return pose
