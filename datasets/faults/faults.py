@@ -69,7 +69,7 @@ class Faults:
     focal_times: PositiveFloat = 1.0  # the stated focal lengths are wrong by this factor
     resize: PositiveFloat = 1.0  # resolution, times what it was; the stated camera is right
     gamma: PositiveFloat = 1.0  # of colour
-    color_noise: NonNegativeFloat = 0.0  # standard deviation, grey levels; also of colour that is frozen
+    color_noise: NonNegativeFloat = 0.0  # standard deviation, grey levels; new in each frame, also where colour alone is frozen
     exposure_ms: NonNegativeFloat = 0.0  # motion blur of colour
     readout_ms: NonNegativeFloat = 0.0  # from the first row to the last: rolling shutter
     moving: Share = 0.0  # share of the image covered by what moves

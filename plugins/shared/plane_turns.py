@@ -19,7 +19,7 @@ TURN_FRAMES, USUAL_FRAMES = 10, 30  # that the difference, and its usual size in
 LARGEST = 2.0  # times the usual size that a frame counts at most
 NORMAL_DEG = 0.2  # added to a plane's own standard deviation: depth has errors that its noise does not show
 PRIOR_DEG = 1.0  # standard deviation of the difference in a frame, before it is measured
-MOST_SIGMAS = 4.0  # of the mean; at most 3.6 of 75 simulated sensors and of sequences of four cameras
+MOST_SIGMAS = 4.0  # of the mean; at most 3.6 of 75 simulated sensors and five sequences, but for one frame of hololens_walk
 LEAST_DEG = 1.0  # over ten frames, that is worth a doubt: less is a bias of depth
 TINY = 1e-9
 
@@ -45,7 +45,8 @@ def with_turn_difference(pose: Pose, previous: Pose, tracks: Tracks | None, plan
 def contradicting_turn(pose: Pose) -> str:
     """Return why depth and colour contradict each other in how the camera turned of late; empty where they do not."""
     mean = math.hypot(*pose.turn_difference.tolist())
-    sigmas = mean * math.sqrt(2 * TURN_FRAMES - 1) / max(pose.usual_turn_difference, TINY)  # the variance of a moving average of independent values
+    usual = pose.usual_turn_difference / math.sqrt(2 * TURN_FRAMES - 1)  # of a moving average of independent values
+    sigmas = mean / max(usual, TINY)
     turned_deg = math.degrees(mean * TURN_FRAMES)
     if sigmas <= MOST_SIGMAS or turned_deg <= LEAST_DEG:
         return ""
