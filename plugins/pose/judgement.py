@@ -24,22 +24,22 @@ from numpy.typing import NDArray
 
 from trihedron.pipeline.core.geometry import invert, transform
 from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat, Share
-from trihedron.pipeline.core.types import DEGRADED, F64, I32, LOST, OK, Keypoints, Planes, Pose, Rotation, Tracks, Translation
+from trihedron.pipeline.core.types import DEGRADED, F32, F64, I32, LOST, OK, Keypoints, Planes, Pose, Rotation, Tracks, Translation
 from trihedron.plugins.mapping.submaps import is_elsewhere
 from trihedron.plugins.pose.calibration_uncertainty import contradicted_calibration
 from trihedron.plugins.pose.dynamic_objects import MovingOptions, Selection, status_with_static
 from trihedron.plugins.pose.map_alignment import InlierStatistics, MapAlignment, TrackingStatus
-from trihedron.plugins.shared.plane_turns import contradicting_turn
+from trihedron.plugins.shared.contradiction import contradiction_so_far, disagreement, plane_counts
 from trihedron.plugins.shared.pose_optimizer import PoseSolution
 from trihedron.plugins.shared.residuals_kernels import NEAR_M
 
 DETAILED = 100  # key points, or matches, with which a frame is expected to be recognised by them
-DISAGREEMENT_FRAMES = 10  # that the disagreement of matched points is averaged over
-MOST_DISAGREEMENT = 0.5  # more is no moment of blur and nobody who walks by; at most 0.35 of five cameras and three simulated ones
 BY_CHANCE = 0.15  # of DETAILED matches that agree by chance: after a jump at most 0.08, between frames of a walk at least 0.31
 MISSING_POINTS = 1000.0  # mapped before the camera was lost, that their missing share is averaged over
 SAME_M, SAME_SHARE = 0.05, 0.03  # and share of its depth, from the plane that is observed there, within which a point lies on it
 SAME_VIEW, SAME_DISTANCE = np.cos(np.deg2rad(30.0)), 1.5  # between views of a point, and ratio of their distances, that show the same of it
+SIGNIFICANT = 10  # key points that move while most repeat, which at most 6 % of five sequences do, and where half the image froze 80 %
+MOVED = 0.001  # that such points move in the image, as a tangent: half a pixel. The images of a camera at rest may be alike
 BLURRED_PX = 1.0  # blur that is worth a word: with more the covariance is half as large again
 
 
@@ -66,6 +66,7 @@ class Evidence:
     rotation: Rotation
     translation: Translation
     submap: int
+    previous: Pose
 
 
 def is_found_again(options: JudgementOptions, evidence: Evidence) -> bool:
@@ -80,6 +81,8 @@ def reason_to_be_lost(options: JudgementOptions, evidence: Evidence, start_statu
     """Return why a frame is lost although the previous one, or relocalisation, gave it a pose (`start_status`); empty where it is not."""
     inliers, tracked = evidence.inliers, is_tracked(options, evidence.inliers)
     agree = f"only {inliers.total} of {inliers.matches} matches"
+    if start_status != LOST and not tracked and (doubt := _repeating(evidence.previous.repeats) or contradiction_so_far(evidence.previous)):
+        return f"{doubt}; and now {agree} with the map agree"
     if evidence.rotation.source == "prediction" and not tracked:
         return f"the rotation was not measured, and {agree} with the map agree"
     continued = int(evidence.translation.inliers[0]), inliers.inliers[0]
@@ -110,26 +113,25 @@ def status_by_images(status: TrackingStatus, evidence: Evidence, repeats: int) -
     if evidence.submap:
         reason = f"in sub-map {evidence.submap}, which is not merged with the first yet: {status.reason}"
         status = replace(status, status=DEGRADED, reason=reason)
-    if status.status == OK and repeats > 1:  # a Kinect repeats single images
-        return replace(status, status=DEGRADED, reason="the images repeat the previous frame bit for bit: at rest, or frozen")
+    if status.status == OK and (reason := _repeating(repeats)):
+        return replace(status, status=DEGRADED, reason=reason)
     return status
 
 
 def judge_by_run(pose: Pose) -> Pose:
     """Degrade an ok pose that contradicts the run so far: its matched points have disagreed for ten frames, planes turned otherwise, what was mapped
     before the latest loss is not there, or the residuals contradict the calibration."""
-    tests = _lasting_disagreement, contradicting_turn, _found_elsewhere, contradicted_calibration
+    tests = contradiction_so_far, _found_elsewhere, contradicted_calibration
     reason = next(filter(None, (test(pose) for test in tests)), "") if pose.status == OK else ""
     return replace(pose, status=DEGRADED, reason=reason) if reason else pose
 
 
-def disagreement(previous: Pose, inliers: InlierStatistics) -> float:
-    """Return the moving average of the share of matched points that do not agree. The first frame with any begins it (an average that begins at zero
-    takes a contradiction from the first frame on for agreement); a frame with few matched points leaves it as it is."""
-    if inliers.matched[0] < DETAILED:
-        return previous.disagreement
-    share = 1.0 - inliers.inliers[0] / inliers.matched[0]
-    return previous.disagreement + (share - previous.disagreement) / DISAGREEMENT_FRAMES if previous.disagreement else share
+def compared(pose: Pose, previous: Pose, inliers: InlierStatistics) -> Pose:
+    """Give a pose what the averages of matched points and planes that disagree are with this frame; one with few matched points leaves theirs as it
+    is."""
+    (points, _, planes), (matched_points, _, matched_planes) = inliers.inliers, inliers.matched
+    average = disagreement(previous, matched_points, points) if matched_points >= DETAILED else previous.disagreement
+    return replace(pose, disagreement=average, plane_counts=plane_counts(previous, matched_planes, planes))
 
 
 def since_loss(pose: Pose, previous: Pose) -> Pose:
@@ -174,12 +176,27 @@ def _is_observed(problem: MapAlignment, points: I32, T_world_camera: F64) -> NDA
 
 def repeated_images(previous: Pose, tracks: Tracks | None, keypoints: Keypoints, planes: Planes) -> int:
     """Return how many images in a row repeat the one before: every tracked key point and plane is bit-identical, which two images of a sensor never
-    are."""
+    are; or most key points are while the others move, once at least."""
     if tracks is None:
         return 0
     points, walls = keypoints.points_m[tracks.keypoints[:, 1]], planes.coefficients[tracks.planes[:, 1]]
-    same = np.array_equal(tracks.points_m, points, True) and np.array_equal(tracks.coefficients, walls, True)
-    return previous.repeats + 1 if len(points) + len(walls) and same else 0
+    whole = len(points) + len(walls) and np.array_equal(tracks.points_m, points, True) and np.array_equal(tracks.coefficients, walls, True)
+    return previous.repeats + 1 if whole or _most_repeat(tracks.points_m, points, previous.repeats > 1) else 0
+
+
+def _repeating(repeats: int) -> str:
+    """Return why so many images in a row that repeat the one before are no measurement; empty for one, which a Kinect repeats now and then."""
+    return "the images repeat the previous frame bit for bit, wholly or in part: at rest, or frozen" if repeats > 1 else ""
+
+
+def _most_repeat(before: F32, now: F32, moved: bool) -> bool:
+    """Return whether most of these tracked key points (n, 3) are bit-identical, and the others move, or have `moved`."""
+    same = (before == now).all(axis=1)
+    others = np.isfinite(before[:, 2]) & np.isfinite(now[:, 2]) & ~same
+    if not SIGNIFICANT <= np.count_nonzero(others) < np.count_nonzero(same):
+        return False
+    shifts = np.abs(before[others, :2] / before[others, 2:] - now[others, :2] / now[others, 2:]).sum(axis=1)
+    return moved or bool(np.median(shifts) > MOVED)
 
 
 def _by_information(options: JudgementOptions, evidence: Evidence) -> TrackingStatus:
@@ -217,10 +234,3 @@ def _found_elsewhere(pose: Pose) -> str:
         return ""
     missing = f"{100.0 * pose.missing:.0f} % of what was mapped before and should be seen is missing"
     return f"the camera was lost in frame {pose.lost_from}, and found again in a place that looks the same: of late {missing}"
-
-
-def _lasting_disagreement(pose: Pose) -> str:
-    """Return why what is seen has contradicted the map for a while, empty where most of it agrees."""
-    if pose.disagreement <= MOST_DISAGREEMENT:
-        return ""
-    return f"colour, depth and map contradict each other: of late {100.0 * pose.disagreement:.0f} % of the matched points disagree"

@@ -32,7 +32,7 @@ from trihedron.plugins.pose.dynamic_objects import Selection, solve_with_static
 from trihedron.plugins.pose.judgement import (
     Evidence,
     JudgementOptions,
-    disagreement,
+    compared,
     is_found_again,
     judge_by_run,
     missing_points,
@@ -44,6 +44,7 @@ from trihedron.plugins.pose.judgement import (
 )
 from trihedron.plugins.pose.map_alignment import MapAlignment
 from trihedron.plugins.pose.world_uncertainty import in_world, keyframe_covariance, propagate_world_covariance
+from trihedron.plugins.shared.contradiction import contradicted_as
 from trihedron.plugins.shared.plane_turns import with_turn_difference
 from trihedron.plugins.shared.pose_optimizer import PoseSolution
 
@@ -93,7 +94,7 @@ class Refine(JudgementOptions):
         problem = MapAlignment(self, start.T_world_camera, self._information(start), camera, matches, keypoints, segments, planes, map)
         solution, static = self._solve(problem, start)
         inliers = problem.statistics(solution)
-        evidence = Evidence(problem, solution, static, inliers, rotation, translation, submap)
+        evidence = Evidence(problem, solution, static, inliers, rotation, translation, submap, previous)
         if start.status == LOST and not is_found_again(self, evidence):
             searched = relocalise is not None and translation.estimated
             return self._stay_lost(start, rotation, previous, searched, map, submap)
@@ -110,9 +111,9 @@ class Refine(JudgementOptions):
         stamps = rotation.index, rotation.stamp_ns
         pose = Pose(*stamps, T, solution.covariance, T_reference_camera, reference, counts, held, status.status, status.reason, submap)
         pose = in_world(replace(pose, repeats=repeats, keyframe_covariance=shared), previous, solution, problem)
-        pose = with_turn_difference(pose, previous, tracks, planes)
+        pose = compared(with_turn_difference(pose, previous, tracks, planes), previous, inliers)
         missing = missing_points(previous, submap, problem, T)
-        return judge_by_run(replace(pose, disagreement=disagreement(previous, inliers), lost_from=previous.lost_from, missing=missing))
+        return judge_by_run(replace(pose, lost_from=previous.lost_from, missing=missing))
 
     def localising(self) -> Refine:
         """Return the refinement of a camera that begins no sub-map: where the loaded map does not reach it stays lost."""
@@ -148,4 +149,4 @@ class Refine(JudgementOptions):
 
     def _unrefined(self, pose: Pose, previous: Pose) -> Pose:
         """Give a pose that the map did not refine what it takes over from the previous one."""
-        return since_loss(propagate_world_covariance(pose, previous), previous)
+        return since_loss(propagate_world_covariance(contradicted_as(pose, previous), previous), previous)

@@ -22,7 +22,7 @@ from trihedron.plugins.pose.dynamic_objects import (
     verified_matches,
     verified_planes,
 )
-from trihedron.plugins.pose.judgement import disagreement
+from trihedron.plugins.pose.judgement import compared
 from trihedron.plugins.pose.map_alignment import InlierStatistics, MapAlignment, TrackingStatus
 from trihedron.plugins.pose.refine import Refine
 from trihedron.plugins.shared.pose_optimizer import PoseSolution
@@ -243,7 +243,26 @@ def test_what_disagrees_for_long_is_a_contradiction(world, map):
 def test_the_first_frame_begins_the_average_of_what_disagrees(matched_points, expected):
     """Colour that is shuffled from the first frame on would be taken for agreement for seven frames."""
     inliers = InlierStatistics((round(0.4 * matched_points), 0, 0), (matched_points, 0, 0))
-    assert disagreement(pose_of(np.eye(4), 0), inliers) == pytest.approx(expected)
+    first = pose_of(np.eye(4), 0)
+    assert compared(first, first, inliers).disagreement == pytest.approx(expected)
+
+
+def test_what_contradicts_is_not_continued_without_the_map(world, map):
+    """A frame that hardly matches the map, after one that contradicted it and after one that did not: it is lost, and keeps what disagreed."""
+    start, features, matches = matched(world, map)
+    few = dataclasses.replace(
+        matches, **{name: getattr(matches, name)[:1] for name in ("keypoints", "segments", "planes", "parallel", "perpendicular")}
+    )
+    before = dataclasses.replace(pose_of(camera_at(STEP - 1), STEP - 1), disagreement=0.57)
+    lost, continued = (
+        Refine()(world.frame(STEP).camera, *start, None, few, *features, dataclasses.replace(before, disagreement=share), map, None)
+        for share in (0.57, 0.2)
+    )
+    reason = (
+        "colour, depth and map contradict each other: of late 57 % of the matched points disagree; and now only 3 of 3 matches with the map agree"
+    )
+    assert (lost.status, lost.reason) == ("lost", reason) and lost.disagreement == 0.57
+    assert continued.status == "degraded"
 
 
 def test_what_was_mapped_before_the_camera_was_lost_is_still_there(world, map):

@@ -12,7 +12,7 @@ from trihedron.pipeline.core.lie import exp_se3, log_se3, rotation_angle_deg
 from trihedron.pipeline.core.types import Pose
 from trihedron.plugins.map.covisibility import Covisibility
 from trihedron.plugins.matches.local_map import LocalMap
-from trihedron.plugins.pose.judgement import is_tracked
+from trihedron.plugins.pose.judgement import is_tracked, repeated_images
 from trihedron.plugins.pose.map_alignment import InlierStatistics
 from trihedron.plugins.pose.none import NoRefinement
 from trihedron.plugins.pose.refine import Refine
@@ -358,6 +358,30 @@ def test_images_that_repeat_twice_are_degraded():
     """The first repetition is one of a Kinect, the second is not; whatever differs ends it."""
     statuses = [(pose.repeats, pose.status) for pose in repeating([False, False, False, True, False])]
     assert statuses == [(1, "ok"), (2, "degraded"), (3, "degraded"), (0, "ok"), (1, "ok")]
+
+
+def partly_repeating(repeating, shift_px):
+    """Tracks, key points and planes of a frame: of 40 tracked key points so many are bit-identical, and the others move by so many pixels."""
+    world = World()
+    keypoints, _, planes = world.features(camera_at(5), 5)
+    now = np.flatnonzero(np.isfinite(keypoints.points_m[:, 2]))[:40].astype(np.int32)
+    before = keypoints.points_m[now]
+    before[repeating:, 0] += shift_px / world.frame(5).camera.fx * before[repeating:, 2]
+    rows = np.stack([now, now], axis=1)
+    return dataclasses.replace(tracks_of(world, 4, 5)[0], keypoints=rows, points_m=before, sigma_m=np.full(40, 0.01, np.float32)), keypoints, planes
+
+
+@pytest.mark.parametrize("repeating, shift_px, repeated", [(30, 1.0, 1), (20, 1.0, 0), (30, 0.2, 0), (36, 1.0, 0)])
+def test_an_image_may_repeat_in_part(repeating, shift_px, repeated):
+    """Half of the points, or fewer, may rest, as a robot's own arm does; points that hardly move are those of a camera at rest."""
+    assert repeated_images(pose_of(camera_at(4), 4), *partly_repeating(repeating, shift_px)) == repeated
+
+
+def test_an_image_that_repeats_in_part_does_so_until_most_of_it_changes():
+    """The camera rests for a frame meanwhile."""
+    seen = partly_repeating(30, shift_px=0.2)
+    previous = [dataclasses.replace(pose_of(camera_at(4), 4), repeats=repeats) for repeats in (1, 2)]
+    assert [repeated_images(pose, *seen) for pose in previous] == [0, 3]
 
 
 def test_a_repeated_image_is_no_measurement():

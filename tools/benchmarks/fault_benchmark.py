@@ -25,6 +25,7 @@ CASES = {  # name -> what the data set is given
     "frozen": ("dataset.freeze=30:60",),
     "frozen_color_with_noise": ("dataset.freeze=30:60", "dataset.frozen=color", "dataset.color_noise=2"),
     "partly_frozen_color": ("dataset.freeze=30:60", "dataset.frozen=color", "dataset.frozen_share=0.7"),
+    "partly_frozen": ("dataset.freeze=30:60", "dataset.frozen_share=0.7"),
     "shuffled_color": ("dataset.shuffle=true",),
     "random_color": ("dataset.cover=30:60", "dataset.covered=color", "dataset.cover_with=random"),
     "black_color": ("dataset.cover=30:60", "dataset.covered=color"),

@@ -1,0 +1,62 @@
+"""Contradictions between colour, depth and the map that last for several frames: such a pose is not ok, and is not mapped.
+
+Each is a share or a rotation averaged over the latest frames: matched points that disagree with their pose; matched planes that do, beyond what is
+usual in this run (with an imperfect calibration most of them may); and planes that turn otherwise than the camera (`plane_turns.py`)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from trihedron.pipeline.core.types import F64, Pose
+from trihedron.plugins.shared.plane_turns import contradicting_turn
+
+AVERAGED_FRAMES = 10  # that the disagreement of points is averaged over
+MOST_DISAGREEMENT = 0.5  # of points: more is no moment of blur and nobody who walks by; at most 0.35 of five cameras and three simulated ones
+AVERAGED_PLANES = np.array([[60.0], [600.0]])  # that their disagreement of late, and the usual one, are averaged over
+UNUSUAL = 0.2  # that a plane counts in what is usual while they disagree
+MOST_DISAGREEING_PLANES = 0.4  # beyond the usual share; at most 0.28 of five sequences and 16 built-in rooms, at least 0.6 where colour froze
+
+
+def contradiction_so_far(pose: Pose) -> str:
+    """Return why the images up to a pose contradict each other or the map, empty where they do not."""
+    return _disagreeing_points(pose) or _disagreeing_planes(pose) or contradicting_turn(pose)
+
+
+def disagreement(previous: Pose, matched: int, agreed: int) -> float:
+    """Return the moving average of the share of matched points that do not agree with the pose. The first frame with any begins it (an average that
+    begins at zero takes a contradiction from the first frame on for agreement)."""
+    share = 1.0 - agreed / matched
+    return previous.disagreement + (share - previous.disagreement) / AVERAGED_FRAMES if previous.disagreement else share
+
+
+def plane_counts(previous: Pose, matched: int, agreed: int) -> F64:
+    """Return `Pose.plane_counts` with the planes of a frame, of which `agreed` agree with the pose. While they contradict it, what is usual changes
+    slowly: a fault of some seconds does not become usual, and a change for good does."""
+    counted = matched * np.array([[1.0], [UNUSUAL if _disagreeing_planes(previous) else 1.0]])
+    kept = AVERAGED_PLANES / (AVERAGED_PLANES + counted)
+    return np.asarray(kept * previous.plane_counts + counted * [1.0 - agreed / max(matched, 1), 1.0], np.float64)
+
+
+def contradicted_as(pose: Pose, previous: Pose) -> Pose:
+    """Give a pose that the map did not refine the previous one's averages: it measures none. How planes turn begins anew, not how they usually do."""
+    usual = previous.usual_turn_difference
+    return replace(pose, disagreement=previous.disagreement, plane_counts=previous.plane_counts, usual_turn_difference=usual)
+
+
+def _disagreeing_points(pose: Pose) -> str:
+    """Return why matched points have contradicted the map for a while, empty where most of them agree."""
+    if pose.disagreement <= MOST_DISAGREEMENT:
+        return ""
+    return f"colour, depth and map contradict each other: of late {100.0 * pose.disagreement:.0f} % of the matched points disagree"
+
+
+def _disagreeing_planes(pose: Pose) -> str:
+    """Return why planes, which depth alone measures, have contradicted the pose for a while, empty where as many agree as usual."""
+    late, usual = (disagreeing / max(matched, 1.0) for disagreeing, matched in pose.plane_counts.tolist())
+    if late - usual <= MOST_DISAGREEING_PLANES:
+        return ""
+    return (
+        f"colour and depth contradict each other: of late {100.0 * late:.0f} % of the planes disagree with the points, usually {100.0 * usual:.0f} %"
+    )
