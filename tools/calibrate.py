@@ -21,10 +21,11 @@ from typing import Any
 import numpy as np
 import yaml
 
-from trihedron.datasets.readers.cameras import PRESETS, Calibration, choose_calibration
+from trihedron.datasets.readers.cameras import Calibration
 from trihedron.datasets.readers.registration import DepthCamera
 from trihedron.pipeline.app.calibrated_run import Recommendation
-from trihedron.pipeline.core.errors import DataError, UsageError
+from trihedron.pipeline.core.config import make_plugin
+from trihedron.pipeline.core.errors import DataError, TrihedronError, UsageError
 from trihedron.pipeline.core.files import write_file
 from trihedron.pipeline.core.text_table import table
 from trihedron.pipeline.core.types import EXACT_DEPTH, F64, CalibrationSigmas, Camera
@@ -238,10 +239,12 @@ def calibration_in_use(recording: Recording, camera: Camera) -> Calibration:
     from trihedron.pipeline.app.recorded_run import composed_run
 
     options = composed_run(recording).dataset
-    folder, plugin = Path(str(options.get("path", ""))).expanduser(), str(options.get("plugin", ""))
+    data_set: Any = make_plugin("dataset", options)
+    if "camera" not in options or not hasattr(data_set, "calibration"):
+        return Calibration(camera, 0.0)
     try:
-        found = choose_calibration(folder, str(options.get("camera", "")), default=plugin if plugin in PRESETS else "")
-    except (DataError, OSError):
+        found: Calibration = data_set.calibration()
+    except (TrihedronError, OSError):  # it is not there any more
         return Calibration(camera, 0.0)
     return found if (found.camera.width, found.camera.fx) == (camera.width, camera.fx) else Calibration(camera, 0.0)
 

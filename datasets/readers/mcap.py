@@ -8,6 +8,8 @@ from functools import cached_property
 from pathlib import Path
 
 from trihedron.datasets.readers.bag_file import BagFile
+from trihedron.datasets.readers.cameras import Calibration, choose_calibration
+from trihedron.datasets.readers.images import check_size
 from trihedron.datasets.readers.robot_recording import RobotRecording, Topics
 from trihedron.datasets.readers.robot_streams import ROS
 from trihedron.datasets.readers.sequence import clip_range, refuse_video
@@ -32,8 +34,9 @@ class McapDataset:
     to it, or one of a robot: messages of ROS (sensor_msgs Image, CompressedImage, compressedDepth, CameraInfo; tf2_msgs) or Foxglove's schemas.
 
     Of a robot's recording the topics are chosen by their type; where several fit, one is named. Colour is undistorted, and paired with the depth
-    nearest in time, which is registered to colour from both intrinsics and the transforms. Without index, or cut off, it is read as far as it is
-    whole. Raises DataError when the file holds no frames, RecordingError when it is missing, damaged or not MCAP."""
+    nearest in time, which is registered to colour from both intrinsics and the transforms. A camera file describes images as they come without it.
+    Without index, or cut off, a recording is read as far as it is whole. Raises DataError when the file holds no frames, RecordingError when it is
+    missing, damaged or not MCAP."""
 
     path: str = ""  # FILE.mcap, FILE.bag of ROS 1, or the folder of a rosbag2
     frames: Frames = ""  # half-open range of frame numbers: A:B, A:, :B, every S-th A:B:S; empty = all
@@ -44,7 +47,8 @@ class McapDataset:
     truth_from: str = ""  # a topic of poses (/mocap/pose), or the frame the transforms of the camera begin from (map); empty = no truth
     max_difference_ms: PositiveFloat = 20.0  # of the stamps of a pair of colour and depth
     depth_delay_ms: float = 0.0  # depth is taken this much later than its stamps; trihedron calibrate estimates it
-    depth_scale: PositiveFloat = 1000.0  # of 16-bit depth: values per metre
+    depth_scale: PositiveFloat = 1000.0  # of 16-bit depth: values per metre; that of a camera file takes its place
+    camera: str = ""  # camera.yaml of the images undistorted and registered by what the recording states; empty = as that states
 
     @cached_property
     def _frames(self) -> _Recorded | RobotRecording:
@@ -56,7 +60,15 @@ class McapDataset:
         if not file.complete:
             log.warning("%s is cut off; what is whole of it is read", file.path)
         topics = Topics(self.color_topic, self.depth_topic, self.color_info_topic, self.depth_info_topic, self.truth_from)
-        return RobotRecording(file, topics, round(self.max_difference_ms * 1e6), round(self.depth_delay_ms * 1e6), self.depth_scale)
+        return RobotRecording(file, topics, round(self.max_difference_ms * 1e6), round(self.depth_delay_ms * 1e6), self._depth_scale)
+
+    @cached_property
+    def _given(self) -> Calibration | None:
+        return choose_calibration(Path(), self.camera) if self.camera else None
+
+    @property
+    def _depth_scale(self) -> float:
+        return self.depth_scale if self._given is None else self._given.depth_scale
 
     @cached_property
     def _range(self) -> range:
@@ -69,7 +81,22 @@ class McapDataset:
     def __call__(self, index: int) -> Frame | None:
         """Read frame `index` of the selection, or None, after a warning, where it cannot be read."""
         with one_line_errors(self.path):
-            return self._frames.frame(self._range[index])
+            frame, given = self._frames.frame(self._range[index]), self._given
+            if frame is None or given is None:
+                return frame
+            camera = given.camera
+            check_size(Path(self.path), frame.color, camera.width, camera.height, "the camera", "give the dataset.camera of these images")
+            color, depth_m = given.rectification.color(frame.color), given.rectification.depth(frame.depth_m)
+            return replace(frame, color=color, depth_m=depth_m, camera=camera)
+
+    def calibration(self) -> Calibration:
+        """Return what the images are converted with: that of the camera file, or the camera that the recording states."""
+        if self._given is not None:
+            return self._given
+        first = next(filter(None, map(self, range(len(self)))), None)
+        if first is None:
+            raise DataError(self.path, "holds no frame that can be read", "record them again")
+        return Calibration(first.camera, self.depth_scale)
 
     def truth(self) -> Trajectory | None:
         """Return the attached ground truth, or that of `truth_from`."""

@@ -111,6 +111,10 @@ class SequenceReader(ABC):
         with one_line_errors(str(self._sequence.color_files[index]), CURE):
             return self._sequence.frame(index)
 
+    def calibration(self) -> Calibration:
+        """Return what the images are converted with."""
+        return self._sequence.calibration
+
     def truth(self) -> Trajectory | None:
         """Return the ground truth that lies with the images, as published but with y down."""
         return self._sequence.truth

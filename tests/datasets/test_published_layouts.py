@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
+from trihedron.datasets.readers.cameras import Calibration
 from trihedron.datasets.readers.replica import Replica
 from trihedron.datasets.readers.scannet import ScanNet
 from trihedron.datasets.readers.seven_scenes import SevenScenes
@@ -105,6 +106,7 @@ def test_replica(replica: Path) -> None:
     assert np.abs(frame.color.astype(int) - [200, 100, 10]).max() <= 2
     assert np.allclose(frame.depth_m, 4 * 6554 / 6553.5, rtol=1e-6)
     assert frame.camera.cx == 59.5 and frame.camera.depth_noise == EXACT_DEPTH
+    assert dataset.calibration() == Calibration(frame.camera, 6553.5)
     noisy = Replica(str(replica), exact_depth=False)(0)
     assert noisy is not None and noisy.camera.depth_noise == DepthNoise()
     truth = dataset.truth()

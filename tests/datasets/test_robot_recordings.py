@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from mcap.writer import CompressionType, IndexType
 from rosbags.rosbag2.enums import CompressionMode
 
@@ -291,3 +292,32 @@ def test_truth_from_a_topic_of_poses(tmp_path: Path) -> None:
         np.testing.assert_allclose(truth.poses, [motion(k) @ on_body for k in range(5)], atol=1e-9)
     with pytest.raises(DataError, match="did you mean '/mocap/pose'"):
         McapDataset(path, truth_from="/mocap/poses").truth()
+
+
+def test_a_camera_file_describes_the_images_as_they_come_without_it(tmp_path: Path) -> None:
+    """Other focal lengths, depth in tenths of a millimetre, and a depth camera beside the colour camera."""
+    path = write_file(tmp_path / "robot.mcap", registered())
+    stated = McapDataset(path=str(path))
+    width, height = WALL.size
+    camera = {"width": width, "height": height, "fx": 90.0, "fy": 91.0, "cx": 40.0, "cy": 30.0, "depth_scale": 10_000.0, "fps": 15.0}
+    (tmp_path / "camera.yaml").write_text(yaml.safe_dump(camera))
+    given = McapDataset(path=str(path), camera=str(tmp_path / "camera.yaml"))
+    frames = stated(1), given(1)
+    assert (frames[1].camera.fx, frames[1].camera.cy, frames[1].camera.fps) == (90.0, 30.0, 15.0)
+    assert np.array_equal(frames[0].color, frames[1].color)
+    assert np.allclose(frames[0].depth_m, 10.0 * frames[1].depth_m, rtol=1e-6)
+    assert stated.calibration().camera == frames[0].camera and stated.calibration().depth_scale == 1000.0
+    assert given.calibration().depth_scale == 10_000.0
+    beside = camera | {"depth_scale": 1000.0, "depth_camera": {"fx": 90.0, "fy": 91.0, "cx": 45.0, "cy": 30.0}}
+    (tmp_path / "camera.yaml").write_text(yaml.safe_dump(beside))
+    moved = McapDataset(path=str(path), camera=str(tmp_path / "camera.yaml"))(1)
+    assert np.allclose(moved.depth_m[:, :-5], frames[0].depth_m[:, 5:], rtol=1e-6)
+
+
+def test_a_camera_file_of_another_size_is_one_line(tmp_path: Path) -> None:
+    path = write_file(tmp_path / "robot.mcap", registered())
+    (tmp_path / "camera.yaml").write_text("width: 640\nheight: 480\nfx: 500\nfy: 500\ncx: 320\ncy: 240\ndepth_scale: 1000\n")
+    with pytest.raises(DataError) as caught:
+        McapDataset(path=str(path), camera=str(tmp_path / "camera.yaml"))(0)
+    width, height = WALL.size
+    assert str(caught.value) == f"{path}: is {width}×{height} while the camera is 640×480; give the dataset.camera of these images"

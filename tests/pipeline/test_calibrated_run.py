@@ -141,7 +141,7 @@ def test_a_delay_that_leaves_frames_without_depth_is_not_applied(right, tmp_path
     (["load_map=map.mcap"],
      "calibrate: the loaded map was made with the stated camera (load_map); make the map with calibrate=true, and load it with its camera.yaml"),
     (["dataset=synthetic"],
-     "calibrate: dataset=synthetic takes no camera file; leave it out; those that do: folder, icl_nuim, replica, seven_scenes, tamu, tum"),
+     "calibrate: dataset=synthetic takes no camera file; leave it out; those that do: folder, icl_nuim, mcap, replica, seven_scenes, tamu, tum"),
     (["graph=plane_odometry"],
      "calibrate: needs matched key points, and this run has no stage map; leave it out, or choose graph=structural"),
     (["dataset.path=out"], "out: {out}/camera.yaml would be replaced, which dataset.path reads; give another out=FOLDER"),
@@ -178,3 +178,13 @@ def test_an_error_of_the_first_pass_is_that_of_the_run(right, tmp_path, capsys):
     assert main(["run", "dataset=tum", f"dataset.path={right}", "dataset.frames=0:2", "calibrate=true", f"out={tmp_path}"]) == 1
     cause = "has fewer than three posed frames; calibrate from a run that tracked its camera"
     assert capsys.readouterr().err == f"trihedron: {tmp_path / 'uncalibrated' / 'run.mcap'}: {cause}\n"
+
+
+def test_a_recording_with_frames_is_calibrated(wrong, tmp_path):
+    """The camera file describes its images, which have the camera of the folder's file."""
+    folder, true, _ = wrong
+    assert main(["convert", str(folder), str(tmp_path / "room.mcap")]) == 0
+    run = th.run("dataset=mcap", dataset__path=tmp_path / "room.mcap", calibrate=True, out=tmp_path / "run", quiet=True)
+    found = read(run.folder / "camera.yaml")
+    assert abs(found["fx"] - true) < 0.01 * true and found["depth_scale"] == 1000.0
+    assert run.metrics["status"]["ok"] == 60 > read(run.folder / "uncalibrated" / "metrics.json")["status"]["ok"]
