@@ -239,8 +239,8 @@ def calibration_in_use(recording: Recording, camera: Camera) -> Calibration:
     from trihedron.pipeline.app.recorded_run import composed_run
 
     options = composed_run(recording).dataset
-    data_set: Any = make_plugin("dataset", options)
-    if "camera" not in options or not hasattr(data_set, "calibration"):
+    data_set: Any = make_plugin("dataset", options) if "camera" in options else None
+    if not hasattr(data_set, "calibration"):
         return Calibration(camera, 0.0)
     try:
         found: Calibration = data_set.calibration()

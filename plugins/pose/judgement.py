@@ -4,13 +4,14 @@ A pose is not trusted because an optimiser converged. Five tests look for reason
 status, with its figures:
 
 - **Information**: landmarks of the map determine all six directions, and there are enough of them.
-- **Agreement**: more matches agree with the pose than would by chance, and most of them did over ten frames.
-- **Contradiction**: what disagrees is not explained by something that moves (`dynamic_objects.py` asks static matches, and planes), planes turn as
-  the camera does (`plane_turns.py`), and the residuals so far do not contradict the camera's calibration (`calibration_uncertainty.py`).
+- **Agreement**: more matches agree with the pose than would by chance.
+- **Contradiction**: what disagrees is not explained by something that moves (`dynamic_objects.py` asks static matches, and planes), of late no more
+  points and planes disagreed than usual, planes turn as the camera does (`contradiction.py`), and the residuals so far do not contradict the
+  camera's calibration (`calibration_uncertainty.py`). A frame that comes after a contradiction, and that the map does not support, is lost.
 - **Continuity**: the rotation was measured, and the frame continues the previous one, or the map knows its details: of a place that is built alike,
   walls and lines agree, and points do not. A camera that was found again keeps finding what was mapped before it was lost; in a room like the one it
   was taken to be in, it does until it leaves.
-- **Freshness**: an image that repeats the one before measures nothing.
+- **Freshness**: an image that repeats the one before, wholly or for the most part, measures nothing.
 
 Limits are options of `pose=refine`, or the constants below. `trihedron benchmark honesty` counts the clean frames that each test degrades (false
 alarms in docs/explanation/results.md)."""
@@ -57,7 +58,8 @@ class JudgementOptions(MovingOptions):
 @dataclass(frozen=True)
 class Evidence:
     """Evidence of a frame for and against a solution: its matches with the map (`problem`), the selection of static ones that the pose was estimated
-    by (None: all), those that agree with it, and the results of the stages before. `submap` is the part of the map that the frame is in."""
+    by (None: all), those that agree with it, the results of the stages before, and the previous pose. `submap` is the part of the map that the frame
+    is in."""
 
     problem: MapAlignment
     solution: PoseSolution

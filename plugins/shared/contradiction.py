@@ -13,7 +13,7 @@ from trihedron.pipeline.core.types import F64, Pose
 from trihedron.plugins.shared.plane_turns import contradicting_turn
 
 AVERAGED_FRAMES = 10  # that the disagreement of points is averaged over
-MOST_DISAGREEMENT = 0.5  # of points: more is no moment of blur and nobody who walks by; at most 0.35 of five cameras and three simulated ones
+MOST_DISAGREEMENT = 0.5  # of points: more is no moment of blur and nobody who walks by; at most 0.35 of five cameras as they are stated
 AVERAGED_PLANES = np.array([[60.0], [600.0]])  # that their disagreement of late, and the usual one, are averaged over
 UNUSUAL = 0.2  # that a plane counts in what is usual while they disagree
 MOST_DISAGREEING_PLANES = 0.4  # beyond the usual share; at most 0.28 of five sequences and 16 built-in rooms, at least 0.6 where colour froze
