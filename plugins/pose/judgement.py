@@ -30,7 +30,7 @@ from trihedron.plugins.mapping.submaps import is_elsewhere
 from trihedron.plugins.pose.calibration_uncertainty import contradicted_calibration
 from trihedron.plugins.pose.dynamic_objects import MovingOptions, Selection, status_with_static
 from trihedron.plugins.pose.map_alignment import InlierStatistics, MapAlignment, TrackingStatus
-from trihedron.plugins.shared.contradiction import contradiction_so_far, disagreement, plane_counts
+from trihedron.plugins.shared.contradiction import contradicting_depth, contradiction_so_far, disagreement, plane_counts
 from trihedron.plugins.shared.pose_optimizer import PoseSolution
 from trihedron.plugins.shared.residuals_kernels import NEAR_M
 
@@ -83,7 +83,7 @@ def reason_to_be_lost(options: JudgementOptions, evidence: Evidence, start_statu
     """Return why a frame is lost although the previous one, or relocalisation, gave it a pose (`start_status`); empty where it is not."""
     inliers, tracked = evidence.inliers, is_tracked(options, evidence.inliers)
     agree = f"only {inliers.total} of {inliers.matches} matches"
-    if start_status != LOST and not tracked and (doubt := _repeating(evidence.previous.repeats) or contradiction_so_far(evidence.previous)):
+    if start_status != LOST and not tracked and (doubt := _repeating(evidence.previous.repeats) or contradicting_depth(evidence.previous)):
         return f"{doubt}; and now {agree} with the map agree"
     if evidence.rotation.source == "prediction" and not tracked:
         return f"the rotation was not measured, and {agree} with the map agree"

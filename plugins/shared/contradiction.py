@@ -21,7 +21,13 @@ MOST_DISAGREEING_PLANES = 0.4  # beyond the usual share; at most 0.34 of 75 simu
 
 def contradiction_so_far(pose: Pose) -> str:
     """Return why the images up to a pose contradict each other or the map, empty where they do not."""
-    return _disagreeing_points(pose) or _disagreeing_planes(pose) or contradicting_turn(pose)
+    return _disagreeing_points(pose) or contradicting_depth(pose)
+
+
+def contradicting_depth(pose: Pose) -> str:
+    """Return why depth contradicts colour up to a pose, empty where it does not. Where most points disagree, something may move over half the image;
+    planes are large and seldom move."""
+    return _disagreeing_planes(pose) or contradicting_turn(pose)
 
 
 def disagreement(previous: Pose, matched: int, agreed: int) -> float:

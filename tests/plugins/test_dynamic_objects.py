@@ -248,20 +248,17 @@ def test_the_first_frame_begins_the_average_of_what_disagrees(matched_points, ex
 
 
 def test_what_contradicts_is_not_continued_without_the_map(world, map):
-    """A frame that hardly matches the map, after one that contradicted it and after one that did not: it is lost, and keeps what disagreed."""
+    """A frame that hardly matches the map, after one whose planes contradicted colour and after one whose did not: it is lost."""
     start, features, matches = matched(world, map)
-    few = dataclasses.replace(
-        matches, **{name: getattr(matches, name)[:1] for name in ("keypoints", "segments", "planes", "parallel", "perpendicular")}
-    )
-    before = dataclasses.replace(pose_of(camera_at(STEP - 1), STEP - 1), disagreement=0.57)
+    kinds = "keypoints", "segments", "planes", "parallel", "perpendicular"
+    few = dataclasses.replace(matches, **{kind: getattr(matches, kind)[:1] for kind in kinds})
+    before = pose_of(camera_at(STEP - 1), STEP - 1)
     lost, continued = (
-        Refine()(world.frame(STEP).camera, *start, None, few, *features, dataclasses.replace(before, disagreement=share), map, None)
-        for share in (0.57, 0.2)
+        Refine()(world.frame(STEP).camera, *start, None, few, *features, dataclasses.replace(before, plane_counts=counts), map, None)
+        for counts in (np.array([[45.0, 60.0], [60.0, 600.0]]), np.array([[10.0, 60.0], [60.0, 600.0]]))
     )
-    reason = (
-        "colour, depth and map contradict each other: of late 57 % of the matched points disagree; and now only 3 of 3 matches with the map agree"
-    )
-    assert (lost.status, lost.reason) == ("lost", reason) and lost.disagreement == 0.57
+    reason = "colour and depth contradict each other: of late 75 % of the planes disagree with the points, usually 10 %; and now "
+    assert (lost.status, lost.reason) == ("lost", reason + "only 3 of 3 matches with the map agree") and lost.plane_counts[0, 0] == 45.0
     assert continued.status == "degraded"
 
 

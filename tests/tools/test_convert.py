@@ -115,7 +115,7 @@ def test_a_replay_of_it_starts_from_its_frames(folder):
         (["there.mcap", "x.mcap"], 1, "there.mcap: is not an MCAP file; give a file that trihedron run or another MCAP writer wrote"),
         (["room", "x.mcap", "--frames=9:3"], 1, "--frames: '9:3' is not a range of frames A:B[:S] with A < B, S > 0; see trihedron convert --help"),
         (["room", "x.mcap", "--dataset", "tun"], 1, "dataset: there is no plugin 'tun' for the slot 'dataset'; did you mean 'tum'?"),
-        (["room.mcap", "x.mcap", "--dataset", "mcap", "--camera", "a"], 1, "dataset=mcap: has no option 'camera'; leave out --camera"),
+        (["room", "x.mcap", "--dataset", "scannet", "--camera", "a"], 1, "dataset=scannet: has no option 'camera'; leave out --camera"),
         (["room", "no/x.mcap"], 1, "no/x.mcap: cannot be written: No such file or directory; give another DST.mcap"),
     ],
 )
