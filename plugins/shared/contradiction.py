@@ -15,6 +15,7 @@ from trihedron.plugins.shared.plane_turns import contradicting_turn
 AVERAGED_FRAMES = 10  # that the disagreement of points is averaged over
 MOST_DISAGREEMENT = 0.5  # of points: more is no moment of blur and nobody who walks by; at most 0.35 of five cameras as they are stated
 AVERAGED_PLANES = np.array([[60.0], [600.0]])  # that their disagreement of late, and the usual one, are averaged over
+LEAST_PLANES = 8  # of a frame that are counted: of fewer, two that are matched wrongly from frame to frame are most
 UNUSUAL = 0.2  # that a plane counts in what is usual while they disagree
 MOST_DISAGREEING_PLANES = 0.4  # beyond the usual share; at most 0.34 of 75 simulated sensors and five sequences, 0.6 and more where colour froze
 
@@ -38,8 +39,10 @@ def disagreement(previous: Pose, matched: int, agreed: int) -> float:
 
 
 def plane_counts(previous: Pose, matched: int, agreed: int) -> F64:
-    """Return `Pose.plane_counts` with the planes of a frame, of which `agreed` agree with the pose. While they contradict it, what is usual changes
-    slowly: a fault of some seconds does not become usual, and a change for good does."""
+    """Return `Pose.plane_counts` with the planes of a frame, of which `agreed` agree with the pose; a frame with few planes leaves them as they are.
+    While they contradict it, what is usual changes slowly: a fault of some seconds does not become usual, and a change for good does."""
+    if matched < LEAST_PLANES:
+        return previous.plane_counts
     counted = matched * np.array([[1.0], [UNUSUAL if _disagreeing_planes(previous) else 1.0]])
     kept = AVERAGED_PLANES / (AVERAGED_PLANES + counted)
     return np.asarray(kept * previous.plane_counts + counted * [1.0 - agreed / max(matched, 1), 1.0], np.float64)

@@ -45,6 +45,8 @@ def test_a_change_for_good_becomes_usual():
     assert all(map(contradiction_so_far, changed[8:50])) and not any(map(contradiction_so_far, changed[90:]))
 
 
-def test_a_frame_with_few_planes_counts_little():
-    """Ten frames with two planes that disagree, after forty with ten that agree."""
-    assert not any(map(contradiction_so_far, followed(followed(FIRST, 40, 10)[-1], 10, 0, matched=2)))
+def test_frames_with_few_planes_are_not_counted():
+    """Of five planes four are matched wrongly, the same for sixty frames, after forty with ten that agree."""
+    clean = followed(FIRST, 40, 10)[-1]
+    few = followed(clean, 60, 1, matched=5)
+    assert not any(map(contradiction_so_far, few)) and np.array_equal(few[-1].plane_counts, clean.plane_counts)
