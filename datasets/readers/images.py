@@ -13,7 +13,7 @@ from trihedron.datasets.readers.picture_headers import JPEG, PNG, UnreadableImag
 from trihedron.pipeline.core.errors import DataError, printable
 from trihedron.pipeline.core.files import SHOWN, read_file
 from trihedron.pipeline.core.png_codec import decode_png, in_rgb
-from trihedron.pipeline.core.types import F32, U8
+from trihedron.pipeline.core.types import F32, U8, Camera
 
 RGB = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
 JPEG_END = b"\xff\xd9"  # of a complete file; a decoder would fill the rest of a truncated one with grey, without an error
@@ -113,3 +113,8 @@ def check_size(path: Path, image: NDArray[Any], width: int, height: int, referen
     """Raise DataError unless the image is width × height, the size of `reference`."""
     if image.shape[:2] != (height, width):
         raise DataError(str(path), f"is {image.shape[1]}×{image.shape[0]} while {reference} is {width}×{height}", cure)
+
+
+def check_camera(path: Path, color: U8, camera: Camera) -> None:
+    """Raise DataError unless a colour image has the size of the camera."""
+    check_size(path, color, camera.width, camera.height, "the camera", "give the dataset.camera of these images")

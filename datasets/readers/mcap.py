@@ -9,7 +9,7 @@ from pathlib import Path
 
 from trihedron.datasets.readers.bag_file import BagFile
 from trihedron.datasets.readers.cameras import Calibration, choose_calibration
-from trihedron.datasets.readers.images import check_size
+from trihedron.datasets.readers.images import check_camera
 from trihedron.datasets.readers.robot_recording import RobotRecording, Topics
 from trihedron.datasets.readers.robot_streams import ROS
 from trihedron.datasets.readers.sequence import clip_range, refuse_video
@@ -60,15 +60,12 @@ class McapDataset:
         if not file.complete:
             log.warning("%s is cut off; what is whole of it is read", file.path)
         topics = Topics(self.color_topic, self.depth_topic, self.color_info_topic, self.depth_info_topic, self.truth_from)
-        return RobotRecording(file, topics, round(self.max_difference_ms * 1e6), round(self.depth_delay_ms * 1e6), self._depth_scale)
+        depth_scale = self.depth_scale if self._given is None else self._given.depth_scale
+        return RobotRecording(file, topics, round(self.max_difference_ms * 1e6), round(self.depth_delay_ms * 1e6), depth_scale)
 
     @cached_property
     def _given(self) -> Calibration | None:
         return choose_calibration(Path(), self.camera) if self.camera else None
-
-    @property
-    def _depth_scale(self) -> float:
-        return self.depth_scale if self._given is None else self._given.depth_scale
 
     @cached_property
     def _range(self) -> range:
@@ -84,10 +81,9 @@ class McapDataset:
             frame, given = self._frames.frame(self._range[index]), self._given
             if frame is None or given is None:
                 return frame
-            camera = given.camera
-            check_size(Path(self.path), frame.color, camera.width, camera.height, "the camera", "give the dataset.camera of these images")
+            check_camera(Path(self.path), frame.color, given.camera)
             color, depth_m = given.rectification.color(frame.color), given.rectification.depth(frame.depth_m)
-            return replace(frame, color=color, depth_m=depth_m, camera=camera)
+            return replace(frame, color=color, depth_m=depth_m, camera=given.camera)
 
     def calibration(self) -> Calibration:
         """Return what the images are converted with: that of the camera file, or the camera that the recording states."""

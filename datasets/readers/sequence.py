@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trihedron.datasets.readers.cameras import Calibration
-from trihedron.datasets.readers.images import check_size, read_color, read_depth
+from trihedron.datasets.readers.images import check_camera, check_size, read_color, read_depth
 from trihedron.datasets.readers.picture_headers import UnreadableImage
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.files import one_line_errors
@@ -76,10 +76,10 @@ class ImageSequence:
         return read_depth(path, self.calibration.depth_scale)
 
     def _check_sizes(self, position: int, color: U8, depth: F32) -> None:
-        camera, path = self.calibration.camera, self.color_files[position]
+        path = self.color_files[position]
         height, width = color.shape[:2]
         check_size(self.depth_files[position], depth, width, height, f"its colour image {path.name}", "register depth to colour first")
-        check_size(path, color, camera.width, camera.height, "the camera", "give the dataset.camera of these images")
+        check_camera(path, color, self.calibration.camera)
 
 
 @dataclass(frozen=True)

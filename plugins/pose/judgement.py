@@ -128,9 +128,9 @@ def judge_by_run(pose: Pose) -> Pose:
     return replace(pose, status=DEGRADED, reason=reason) if reason else pose
 
 
-def compared(pose: Pose, previous: Pose, inliers: InlierStatistics) -> Pose:
-    """Give a pose what the averages of matched points and planes that disagree are with this frame; one with few matched points leaves theirs as it
-    is."""
+def with_disagreement(pose: Pose, previous: Pose, inliers: InlierStatistics) -> Pose:
+    """Give a pose the averages of the previous one, updated by the matched points and planes of this frame that disagree; few matched points leave
+    theirs as it is."""
     (points, _, planes), (matched_points, _, matched_planes) = inliers.inliers, inliers.matched
     average = disagreement(previous, matched_points, points) if matched_points >= DETAILED else previous.disagreement
     return replace(pose, disagreement=average, plane_counts=plane_counts(previous, matched_planes, planes))
@@ -178,7 +178,7 @@ def _is_observed(problem: MapAlignment, points: I32, T_world_camera: F64) -> NDA
 
 def repeated_images(previous: Pose, tracks: Tracks | None, keypoints: Keypoints, planes: Planes) -> int:
     """Return how many images in a row repeat the one before: every tracked key point and plane is bit-identical, which two images of a sensor never
-    are; or most key points are while the others move, once at least."""
+    are; or most key points are while the others move. Once two images in a row did so, the others need not move."""
     if tracks is None:
         return 0
     points, walls = keypoints.points_m[tracks.keypoints[:, 1]], planes.coefficients[tracks.planes[:, 1]]

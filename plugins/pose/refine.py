@@ -32,7 +32,6 @@ from trihedron.plugins.pose.dynamic_objects import Selection, solve_with_static
 from trihedron.plugins.pose.judgement import (
     Evidence,
     JudgementOptions,
-    compared,
     is_found_again,
     judge_by_run,
     missing_points,
@@ -41,10 +40,11 @@ from trihedron.plugins.pose.judgement import (
     since_loss,
     status_by_images,
     status_by_matches,
+    with_disagreement,
 )
 from trihedron.plugins.pose.map_alignment import MapAlignment
 from trihedron.plugins.pose.world_uncertainty import in_world, keyframe_covariance, propagate_world_covariance
-from trihedron.plugins.shared.contradiction import contradicted_as
+from trihedron.plugins.shared.contradiction import with_averages_of
 from trihedron.plugins.shared.plane_turns import with_turn_difference
 from trihedron.plugins.shared.pose_optimizer import PoseSolution
 
@@ -111,7 +111,7 @@ class Refine(JudgementOptions):
         stamps = rotation.index, rotation.stamp_ns
         pose = Pose(*stamps, T, solution.covariance, T_reference_camera, reference, counts, held, status.status, status.reason, submap)
         pose = in_world(replace(pose, repeats=repeats, keyframe_covariance=shared), previous, solution, problem)
-        pose = compared(with_turn_difference(pose, previous, tracks, planes), previous, inliers)
+        pose = with_disagreement(with_turn_difference(pose, previous, tracks, planes), previous, inliers)
         missing = missing_points(previous, submap, problem, T)
         return judge_by_run(replace(pose, lost_from=previous.lost_from, missing=missing))
 
@@ -149,4 +149,4 @@ class Refine(JudgementOptions):
 
     def _unrefined(self, pose: Pose, previous: Pose) -> Pose:
         """Give a pose that the map did not refine what it takes over from the previous one."""
-        return since_loss(propagate_world_covariance(contradicted_as(pose, previous), previous), previous)
+        return since_loss(propagate_world_covariance(with_averages_of(previous, pose), previous), previous)

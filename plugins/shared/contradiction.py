@@ -45,11 +45,12 @@ def plane_counts(previous: Pose, matched: int, agreed: int) -> F64:
         return previous.plane_counts
     counted = matched * np.array([[1.0], [UNUSUAL if _disagreeing_planes(previous) else 1.0]])
     kept = AVERAGED_PLANES / (AVERAGED_PLANES + counted)
-    return np.asarray(kept * previous.plane_counts + counted * [1.0 - agreed / max(matched, 1), 1.0], np.float64)
+    return np.asarray(kept * previous.plane_counts + counted * [1.0 - agreed / matched, 1.0], np.float64)
 
 
-def contradicted_as(pose: Pose, previous: Pose) -> Pose:
-    """Give a pose that the map did not refine the previous one's averages: it measures none. How planes turn begins anew, not how they usually do."""
+def with_averages_of(previous: Pose, pose: Pose) -> Pose:
+    """Give a pose that the map did not refine, and that measured nothing to average, the averages of the previous one. Only the mean of how planes
+    turn otherwise begins anew."""
     usual = previous.usual_turn_difference
     return replace(pose, disagreement=previous.disagreement, plane_counts=previous.plane_counts, usual_turn_difference=usual)
 

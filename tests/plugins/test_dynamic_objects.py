@@ -22,7 +22,7 @@ from trihedron.plugins.pose.dynamic_objects import (
     verified_matches,
     verified_planes,
 )
-from trihedron.plugins.pose.judgement import compared
+from trihedron.plugins.pose.judgement import with_disagreement
 from trihedron.plugins.pose.map_alignment import InlierStatistics, MapAlignment, TrackingStatus
 from trihedron.plugins.pose.refine import Refine
 from trihedron.plugins.shared.pose_optimizer import PoseSolution
@@ -244,7 +244,7 @@ def test_the_first_frame_begins_the_average_of_what_disagrees(matched_points, ex
     """Colour that is shuffled from the first frame on would be taken for agreement for seven frames."""
     inliers = InlierStatistics((round(0.4 * matched_points), 0, 0), (matched_points, 0, 0))
     first = pose_of(np.eye(4), 0)
-    assert compared(first, first, inliers).disagreement == pytest.approx(expected)
+    assert with_disagreement(first, first, inliers).disagreement == pytest.approx(expected)
 
 
 def test_what_contradicts_is_not_continued_without_the_map(world, map):
