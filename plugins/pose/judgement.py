@@ -128,11 +128,12 @@ def judge_by_run(pose: Pose) -> Pose:
     return replace(pose, status=DEGRADED, reason=reason) if reason else pose
 
 
-def with_disagreement(pose: Pose, previous: Pose, inliers: InlierStatistics) -> Pose:
-    """Give a pose the averages of the previous one, updated by the matched points and planes of this frame that disagree; few matched points leave
-    theirs as it is."""
+def with_disagreement(pose: Pose, previous: Pose, inliers: InlierStatistics, static: Selection | None) -> Pose:
+    """Give a pose the averages of the previous one, updated by the matched points and planes of this frame that disagree. Few matched points leave
+    theirs as it is, and so does a pose by planes alone, for which all points may be what moves."""
     (points, _, planes), (matched_points, _, matched_planes) = inliers.inliers, inliers.matched
-    average = disagreement(previous, matched_points, points) if matched_points >= DETAILED else previous.disagreement
+    counted = matched_points >= DETAILED and static is not Selection.PLANES
+    average = disagreement(previous, matched_points, points) if counted else previous.disagreement
     return replace(pose, disagreement=average, plane_counts=plane_counts(previous, matched_planes, planes))
 
 

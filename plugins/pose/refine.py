@@ -111,7 +111,7 @@ class Refine(JudgementOptions):
         stamps = rotation.index, rotation.stamp_ns
         pose = Pose(*stamps, T, solution.covariance, T_reference_camera, reference, counts, held, status.status, status.reason, submap)
         pose = in_world(replace(pose, repeats=repeats, keyframe_covariance=shared), previous, solution, problem)
-        pose = with_disagreement(with_turn_difference(pose, previous, tracks, planes), previous, inliers)
+        pose = with_disagreement(with_turn_difference(pose, previous, tracks, planes), previous, inliers, static)
         missing = missing_points(previous, submap, problem, T)
         return judge_by_run(replace(pose, lost_from=previous.lost_from, missing=missing))
 

@@ -239,12 +239,13 @@ def test_what_disagrees_for_long_is_a_contradiction(world, map):
     assert poses[1].status == "ok" and 0.44 < poses[1].disagreement < 0.5
 
 
-@pytest.mark.parametrize("matched_points, expected", [(200, 0.6), (99, 0.0)])
-def test_the_first_frame_begins_the_average_of_what_disagrees(matched_points, expected):
-    """Colour that is shuffled from the first frame on would be taken for agreement for seven frames."""
+@pytest.mark.parametrize("matched_points, static, expected", [(200, None, 0.6), (99, None, 0.0), (200, Selection.PLANES, 0.0)])
+def test_the_first_frame_begins_the_average_of_what_disagrees(matched_points, static, expected):
+    """Colour that is shuffled from the first frame on would be taken for agreement for seven frames; with a pose by planes alone, what disagrees may
+    move."""
     inliers = InlierStatistics((round(0.4 * matched_points), 0, 0), (matched_points, 0, 0))
     first = pose_of(np.eye(4), 0)
-    assert with_disagreement(first, first, inliers).disagreement == pytest.approx(expected)
+    assert with_disagreement(first, first, inliers, static).disagreement == pytest.approx(expected)
 
 
 def test_what_contradicts_is_not_continued_without_the_map(world, map):
