@@ -80,7 +80,7 @@ def factor_positive(H: F64, L: F64) -> bool:
 
 @kernel
 def solve_positive(H: F64, g: F64, x: F64) -> bool:
-    """x (n,) with `H x = g` for a symmetric positive definite H (n, n), by Cholesky; False, and x zero, when H is not positive definite."""
+    """Fill x with the solution (n,) of `H x = g` for a symmetric positive definite H (n, n), by Cholesky; False, and x zero, when H is not."""
     n = len(g)
     L = np.zeros((n, n))
     for i in range(n):
@@ -89,6 +89,15 @@ def solve_positive(H: F64, g: F64, x: F64) -> bool:
         return False
     for i in range(n):
         x[i] = g[i]
+    _substitute(L, x)
+    return True
+
+
+@kernel(forceinline=True)
+def _substitute(L: F64, x: F64) -> None:
+    """Replace the first n numbers of x by the solution of `L Lᵀ y = x` for a Cholesky factor L (n, n)."""
+    n = len(L)
+    for i in range(n):
         for k in range(i):
             x[i] -= L[i, k] * x[k]
         x[i] /= L[i, i]
@@ -96,18 +105,17 @@ def solve_positive(H: F64, g: F64, x: F64) -> bool:
         for k in range(i + 1, n):
             x[i] -= L[k, i] * x[k]
         x[i] /= L[i, i]
-    return True
 
 
 @kernel
 def inverse_positive(H: F64) -> F64:
     """Inverse of a symmetric positive definite H (n, n); zeros where it is none."""
     n = len(H)
-    out, unit = np.empty((n, n)), np.zeros(n)
-    for k in range(n):
-        unit[k] = 1.0
-        solve_positive(H, unit, out[k])
-        unit[k] = 0.0
+    out, L = np.zeros((n, n)), np.zeros((n, n))
+    if factor_positive(H, L):
+        for k in range(n):
+            out[k, k] = 1.0
+            _substitute(L, out[k])
     return out
 
 

@@ -14,13 +14,21 @@ from dataclasses import replace
 import numpy as np
 
 from trihedron.pipeline.core.geometry import invert
-from trihedron.pipeline.core.lie import adjoint, log_se3
-from trihedron.pipeline.core.linalg import inv, matmul
-from trihedron.pipeline.core.types import F64, LOST, Map, Pose
+from trihedron.pipeline.core.kernel import constant
+from trihedron.pipeline.core.lie import log_se3
+from trihedron.pipeline.core.linalg import matmul
+from trihedron.pipeline.core.types import F64, I32, LOST, Map, Pose
 from trihedron.plugins.pose.map_alignment import MapAlignment
 from trihedron.plugins.shared.calibration_error import CALIBRATION_NAMES, calibration_scales
-from trihedron.plugins.shared.calibration_error_kernels import Equations, Keyframes, calibration_equations, calibration_moment
-from trihedron.plugins.shared.pose_optimizer import PoseSolution
+from trihedron.plugins.shared.calibration_error_kernels import (
+    Keyframes,
+    Observers,
+    calibration_equations,
+    calibration_moment,
+    keyframes_at,
+    moved_sensitivity,
+    sensitivity_and_evidence,
+)
 from trihedron.plugins.shared.pose_optimizer_kernels import Flags
 
 REPEATED_FRAMES = 20  # in which the errors of a landmark's residuals repeat: so many frames tell of the calibration as much as one
@@ -46,20 +54,39 @@ def with_velocity(pose: Pose, previous: Pose, map: Map) -> Pose:
     return replace(pose, twist=twist, reference_twist=reference_twist)
 
 
-def with_calibration(pose: Pose, previous: Pose, solution: PoseSolution, problem: MapAlignment) -> Pose:
+def with_calibration(pose: Pose, previous: Pose, problem: MapAlignment, flags: Flags, keyframes: Keyframes, observed: Observers) -> Pose:
     """Give a refined pose its sensitivity to the calibration, and what its residuals add to what is known of that."""
-    equations = _equations(pose, solution, problem)
-    before = matmul(adjoint(matmul(invert(pose.T_world_camera), previous.T_world_camera)), previous.sensitivity)
-    to_pose = inv(equations.H + problem.information)
-    share = matmul(equations.C.T, to_pose)
+    T, camera = constant(pose.T_world_camera, np.float64), problem.camera
+    points, _, planes = problem.terms(pose.T_world_camera)
+    samples = problem.map.planes.rows("samples_m", problem.matches.planes[:, 1])
+    surfaces = problem.surfaces_at(problem.keypoints.pixels[problem.matches.keypoints[:, 0]])
+    equations = calibration_equations(
+        T, camera.intrinsics, camera.width, camera.height, calibration_scales(camera), pose.twist, points, planes, flags, surfaces, samples, observed,
+        keyframes,
+    )  # fmt: skip
+    before = carried_sensitivity(pose, previous)
+    sensitivity, information, score = sensitivity_and_evidence(equations, problem.information, before)
     scale = REPEATED_FRAMES * pose.noise_scale
     return replace(
         pose,
-        sensitivity=matmul(to_pose, matmul(problem.information, before) - equations.C),
-        calibration_information=previous.calibration_information + _symmetric(equations.G - matmul(share, equations.C)) / scale,
-        calibration_score=previous.calibration_score + (equations.s - matmul(share, equations.b)) / scale,
-        depth_scale_sigma=problem.camera.sigmas.depth_scale,
+        sensitivity=sensitivity,
+        calibration_information=previous.calibration_information + information / scale,
+        calibration_score=previous.calibration_score + score / scale,
+        depth_scale_sigma=camera.sigmas.depth_scale,
     )
+
+
+def keyframes_seen(pose: Pose, map: Map, rows: I32, poses: F64) -> Keyframes:
+    """Return the keyframes in these rows (k,) of the map, of which the poses are (k, 4, 4), as the camera's calibration bends them."""
+    sensitivities, twists = map.keyframes.columns_at(rows, "sensitivity", "twist")
+    twists[rows == pose.reference] = pose.reference_twist
+    return keyframes_at(constant(pose.T_world_camera, np.float64), poses, twists, sensitivities)
+
+
+def carried_sensitivity(pose: Pose, previous: Pose) -> F64:
+    """Return the previous pose's sensitivity as that of a camera that moves with it."""
+    T, before = (constant(T, np.float64) for T in (pose.T_world_camera, previous.T_world_camera))
+    return moved_sensitivity(T, before, previous.sensitivity)
 
 
 def contradicted_calibration(pose: Pose) -> str:
@@ -78,28 +105,8 @@ def carried_calibration(pose: Pose, previous: Pose) -> Pose:
     """Give a pose that was not refined the previous one's error by the calibration, as a camera that moves with it."""
     return replace(
         pose,
-        sensitivity=matmul(adjoint(matmul(invert(pose.T_world_camera), previous.T_world_camera)), previous.sensitivity),
+        sensitivity=carried_sensitivity(pose, previous),
         calibration_information=previous.calibration_information,
         calibration_score=previous.calibration_score,
         depth_scale_sigma=previous.depth_scale_sigma,
     )
-
-
-def _symmetric(matrix: F64) -> F64:
-    return np.asarray(0.5 * (matrix + matrix.T))
-
-
-def _equations(pose: Pose, solution: PoseSolution, problem: MapAlignment) -> Equations:
-    map, T, camera = problem.map, pose.T_world_camera, problem.camera
-    rows, observers = problem.observed_by()
-    poses, sensitivities, twists = (map.keyframes.rows(name, rows) for name in ("T_world_camera", "sensitivity", "twist"))
-    twists[rows == pose.reference] = pose.reference_twist
-    errors = matmul(adjoint(matmul(invert(T), poses)), sensitivities)
-    keyframes = Keyframes(np.ascontiguousarray(poses[:, :3, :3]), np.ascontiguousarray(poses[:, :3, 3]), twists, errors)
-    points, _, planes = problem.terms(T)
-    samples = map.planes.rows("samples_m", problem.plane_ids())
-    surfaces = problem.surfaces_at(problem.keypoints.pixels[problem.matches.keypoints[:, 0]])
-    return calibration_equations(
-        T, camera.intrinsics, camera.width, camera.height, calibration_scales(camera), pose.twist, points, planes,
-        Flags(solution.points, solution.lines, solution.planes), surfaces, samples, observers, keyframes,
-    )  # fmt: skip

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
 
+from trihedron.pipeline.core.kernel import constant
 from trihedron.pipeline.core.types import F32, F64, I32, Camera, Keypoints, Map, Matches, Planes, Segments
 from trihedron.plugins.mapping.projection import line_terms, plane_terms, point_terms
+from trihedron.plugins.pose.map_alignment_kernels import number_keyframes, observed_surfaces
 from trihedron.plugins.shared.calibration_error_kernels import Observers
 from trihedron.plugins.shared.pose_optimizer import (
     LANDMARK_SCORE,
@@ -17,10 +20,10 @@ from trihedron.plugins.shared.pose_optimizer import (
     Terms,
     classify_terms,
     first_step,
-    grouped_equations,
     solve_pose,
 )
 from trihedron.plugins.shared.pose_optimizer_kernels import Flags, Groups
+from trihedron.plugins.shared.residuals_kernels import LineTerms, PlaneTerms, PointTerms
 
 
 @dataclass(frozen=True)
@@ -84,23 +87,21 @@ class MapAlignment:
     segments: Segments
     planes: Planes
     map: Map
-    made: dict[bytes, Terms] = field(default_factory=dict)  # pose -> terms
+    made: dict[bytes, LineTerms] = field(default_factory=dict)  # pose -> terms of lines
 
     def terms(self, T_world_camera: F64) -> Terms:
         """All matches as terms; the extent of lines is that seen from a pose. Those of one pose are made once."""
-        key = T_world_camera.tobytes()
+        key, (points, planes) = T_world_camera.tobytes(), self._points_and_planes
         if key not in self.made:
-            self.made[key] = self._terms(T_world_camera)
-        return self.made[key]
+            line_sigma_px = math.hypot(self.options.line_sigma_px, self.keypoints.blur_px)
+            self.made[key] = line_terms(self.map, self.segments, self.matches.segments, T_world_camera, self.camera, line_sigma_px)
+        return points, self.made[key], planes
 
-    def _terms(self, T_world_camera: F64) -> Terms:
-        map, matches = self.map, self.matches
-        line_sigma_px = math.hypot(self.options.line_sigma_px, self.keypoints.blur_px)
-        return (
-            point_terms(map, self.keypoints, matches.keypoints),
-            line_terms(map, self.segments, matches.segments, T_world_camera, self.camera, line_sigma_px),
-            plane_terms(map, self.planes, matches.planes, matches.parallel, matches.perpendicular, self.options.relation_sigma_deg),
-        )
+    @cached_property
+    def _points_and_planes(self) -> tuple[PointTerms, PlaneTerms]:
+        map, matches, sigma_deg = self.map, self.matches, self.options.relation_sigma_deg
+        points = point_terms(map, self.keypoints, matches.keypoints)
+        return points, plane_terms(map, self.planes, matches.planes, matches.parallel, matches.perpendicular, sigma_deg)
 
     def solve(self, terms: Terms) -> PoseSolution:
         """Estimate the pose from these terms and the prior."""
@@ -128,34 +129,19 @@ class MapAlignment:
         matches = self.matches
         return np.concatenate([pairs[:, 1] for pairs in (matches.planes, matches.parallel, matches.perpendicular)])
 
-    def created_by(self) -> tuple[I32, Groups]:
-        """The keyframes (k,) that created the matched landmarks, and which of them created each."""
+    def keyframes(self) -> tuple[I32, Groups, Observers]:
+        """The keyframes (k,) that created or observed the matched landmarks; which of them created each, and which observed each of the points and of
+        the identical planes."""
         map, matches = self.map, self.matches
-        tables = (map.points, matches.keypoints[:, 1]), (map.lines, matches.segments[:, 1]), (map.planes, self.plane_ids())
-        first = [table.rows("first", ids) for table, ids in tables]
-        keyframes, numbers = np.unique(np.concatenate(first), return_inverse=True)
-        return keyframes, Groups(*(part.astype(np.int32) for part in np.split(numbers, np.cumsum([len(part) for part in first[:2]]))))
-
-    def observed_by(self) -> tuple[I32, Observers]:
-        """The keyframes (k,) that observed the matched points and planes, and which of them observed each."""
-        points, planes = self.map.points.rows("observers", self.matches.keypoints[:, 1]), self.map.planes.rows("observers", self.plane_ids())
-        number = np.zeros(len(self.map.keyframes) + 1, np.int32)  # the last is that of -1, no keyframe
-        number[points], number[planes], number[-1] = 1, 1, 0
-        keyframes = np.flatnonzero(number).astype(np.int32)
-        number[keyframes], number[-1] = np.arange(len(keyframes)), -1
-        return keyframes, Observers(number[points], number[planes])
-
-    def equations_by_keyframe(self, solution: PoseSolution, keyframes: I32, groups: Groups) -> tuple[F64, F64]:
-        """The normal equations of each keyframe's landmarks that agree with a solution: information (k, 6, 6) and score (k, 6)."""
-        T, flags = solution.T_world_camera, Flags(solution.points, solution.lines, solution.planes)
-        return grouped_equations(T, self.camera, self.terms(T), flags, groups, len(keyframes))
+        first, observers = map.points.columns_at(matches.keypoints[:, 1], "first", "observers")
+        created = Groups(first, map.lines.rows("first", matches.segments[:, 1]), map.planes.rows("first", self.plane_ids()))
+        observed = Observers(observers, map.planes.rows("observers", matches.planes[:, 1]))
+        return number_keyframes(len(map.keyframes), created, observed), created, observed
 
     def surfaces_at(self, pixels: F32 | F64) -> F64:
         """The observed planes (n, 4) at pixels (n, 2); NaN for none."""
-        labels, stride = self.planes.labels, self.planes.stride
-        x, y = np.rint(pixels / stride).astype(int).T
-        label = labels[np.clip(y, 0, labels.shape[0] - 1), np.clip(x, 0, labels.shape[1] - 1)]
-        return np.asarray(np.concatenate([np.full((1, 4), np.nan), self.planes.coefficients])[label], np.float64)
+        planes = self.planes
+        return observed_surfaces(planes.labels, planes.stride, planes.coefficients, constant(pixels, np.float64))
 
     def landmarks(self, solution: PoseSolution) -> tuple[I32, I32, I32]:
         """Ids of the points, lines and planes that agree with a solution."""

@@ -7,19 +7,22 @@ is the same at all of them (`calibration_uncertainty.py`). An image that repeats
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from trihedron.pipeline.core.geometry import invert
+from trihedron.pipeline.core.kernel import constant
 from trihedron.pipeline.core.lie import adjoint
 from trihedron.pipeline.core.linalg import eigvalsh, matmul
-from trihedron.pipeline.core.linalg_kernels import inverse_positive
 from trihedron.pipeline.core.types import F64, I32, Map, Pose
-from trihedron.plugins.pose.calibration_uncertainty import carried_calibration, with_calibration, with_velocity
+from trihedron.plugins.pose.calibration_uncertainty import carried_calibration, keyframes_seen, with_calibration, with_velocity
 from trihedron.plugins.pose.map_alignment import MapAlignment
+from trihedron.plugins.pose.world_uncertainty_kernels import scatter_and_drift
 from trihedron.plugins.shared.calibration_error import calibration_covariance
-from trihedron.plugins.shared.pose_optimizer import LANDMARK_SCORE, PoseSolution, residual_scale
+from trihedron.plugins.shared.pose_optimizer import LANDMARK_SCORE, PoseSolution
+from trihedron.plugins.shared.pose_optimizer_kernels import Flags
 
 SCALE_FRAMES = 10  # over which the scale of the residuals is averaged
 SCALE_OUTLIER = 4.0  # times the average that a frame's scale counts at most
@@ -79,20 +82,22 @@ def keyframe_covariance(solution: PoseSolution, problem: MapAlignment, factor: f
 
 def in_world(pose: Pose, previous: Pose, solution: PoseSolution, problem: MapAlignment) -> Pose:
     """Give a refined pose its covariance in the world, scaled by the noise that the residuals show."""
-    keyframes, groups = problem.created_by()
-    information, scores = problem.equations_by_keyframe(solution, keyframes, groups)
-    scale, noise_scale = residual_scale(information, scores), previous.noise_scale
-    if scale is not None:
-        noise_scale += (min(scale, SCALE_OUTLIER * noise_scale) - noise_scale) / SCALE_FRAMES
-    if information.any():
-        poses, covariances = (problem.map.keyframes.rows(name, keyframes) for name in ("T_world_camera", "world_covariance"))
-        by_drift = covariance_of_keyframes(pose.T_world_camera, poses, covariances, information)
-    else:
+    rows, created, observed = problem.keyframes()
+    poses, covariances = problem.map.keyframes.columns_at(rows, "T_world_camera", "world_covariance")
+    T, flags = pose.T_world_camera, Flags(solution.points, solution.lines, solution.planes)
+    scale, by_drift, supported = scatter_and_drift(
+        constant(T, np.float64), problem.camera.intrinsics, *problem.terms(T), flags, created, poses, covariances
+    )
+    if not supported:
         by_drift = drift_of_previous(pose, previous)
+    noise_scale = previous.noise_scale
+    if not math.isnan(scale):
+        noise_scale += (min(scale, SCALE_OUTLIER * noise_scale) - noise_scale) / SCALE_FRAMES
     moving = with_velocity(replace(pose, noise_scale=noise_scale), previous, problem.map)
     if pose.repeats:
         return _with_unseen_motion(_with_world_covariance(carried_calibration(moving, previous), by_drift), previous)
-    return _with_world_covariance(with_calibration(moving, previous, solution, problem), by_drift)
+    keyframes = keyframes_seen(moving, problem.map, rows, poses)
+    return _with_world_covariance(with_calibration(moving, previous, problem, flags, keyframes, observed), by_drift)
 
 
 def _with_unseen_motion(pose: Pose, previous: Pose) -> Pose:
@@ -107,19 +112,6 @@ def _with_world_covariance(pose: Pose, by_drift: F64) -> Pose:
     """Turn a pose whose `covariance` is the one relative to the landmarks near it into one whose `covariance` is that in the world."""
     of_map = by_drift + calibration_covariance(pose)
     return replace(pose, covariance=pose.noise_scale * pose.covariance + of_map, map_covariance=of_map)
-
-
-def covariance_of_keyframes(T_world_camera: F64, T_world_keyframe: F64, covariance: F64, information: F64) -> F64:
-    """Covariance (6, 6) of the average error of keyframes in the order of time, their poses (k, 4, 4) and covariances (k, 6, 6), each weighted by the
-    information (k, 6, 6) of its landmarks, as that of xi of the camera.
-
-    The errors of keyframes are a random walk, in which the covariance of two is the variance of the earlier."""
-    to_camera = adjoint(matmul(invert(T_world_camera), T_world_keyframe))
-    weights = np.trace(matmul(information, inverse_positive(information.sum(axis=0) + np.eye(6))), axis1=1, axis2=2)
-    weights = weights / weights.sum()
-    later = np.cumsum(weights[::-1])[::-1] - weights
-    common = matmul((weights * (weights + 2.0 * later))[:, None, None] * to_camera, covariance, to_camera.transpose(0, 2, 1))
-    return np.asarray(common.sum(axis=0), np.float64)
 
 
 def drift_of_previous(pose: Pose, previous: Pose) -> F64:

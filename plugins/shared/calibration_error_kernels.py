@@ -13,6 +13,7 @@ import numpy as np
 from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.linalg_kernels import inverse_positive, matmul, matvec, tangent_columns
 from trihedron.pipeline.core.types import CALIBRATION, F32, F64, I32, U8
+from trihedron.plugins.shared.lie_kernels import adjoint_between
 from trihedron.plugins.shared.pose_optimizer_kernels import Flags
 from trihedron.plugins.shared.residuals_kernels import (
     NEAR_M,
@@ -43,7 +44,7 @@ class Keyframes(NamedTuple):
 
 
 class Observers(NamedTuple):
-    """Numbers of the keyframes that observed each point (n, o) and each plane (p, o); -1 for none."""
+    """Numbers of the keyframes that observed each point (n, o) and each identical plane (p, o), which are the first of the planes; -1 for none."""
 
     points: I32
     planes: I32
@@ -59,7 +60,7 @@ class Equations(NamedTuple):
     s: F64
 
 
-@kernel
+@kernel(forceinline=True)
 def keypoint_errors(p: F64, plane: F64, twist: F64, camera: F64, width: int, height: int, E: F64) -> None:
     """Fill E (3, 12): errors of a key point's u, v (px) and of the inverse depth at it, by each parameter in its own unit.
 
@@ -82,7 +83,7 @@ def keypoint_errors(p: F64, plane: F64, twist: F64, camera: F64, width: int, hei
         E[2, 9], E[2, 10], E[2, 11] = -moved * row, E[2, 10] + moved, E[2, 11] + moved * row
 
 
-@kernel
+@kernel(forceinline=True)
 def plane_point_error(p: F64, plane: F64, twist: F64, camera: F64, width: int, height: int, E: F64) -> None:
     """Fill E (12,): error (m) along a plane's normal of a point p (3,) on it, as depth and its ray give it, by each parameter in its own unit."""
     fx, fy, iz = camera[0], camera[1], 1.0 / p[2]
@@ -100,39 +101,38 @@ def plane_point_error(p: F64, plane: F64, twist: F64, camera: F64, width: int, h
     E[11] = E[10] * row
 
 
-@kernel
-def _add(J: F64, W: F64, K: F64, r: F64, total: Equations) -> None:
-    """Add a residual r (3,) of information W (3, 3), with Jacobians J (3, 6) by the pose and K (3, 12) by the calibration."""
-    WK = np.empty(CALIBRATION)
+@kernel(forceinline=True)
+def _add(J: F64, W: F64, K: F64, r: F64, WJ: F64, WK: F64, total: Equations) -> None:
+    """Add a residual r (3,) of information W (3, 3), with Jacobians J (3, 6) by the pose and K (3, 12) by the calibration; WJ and WK are overwritten
+    with their products."""
     for i in range(3):
-        e = W[i, 0] * r[0] + W[i, 1] * r[1] + W[i, 2] * r[2]
+        for k in range(6):
+            WJ[i, k] = W[i, 0] * J[0, k] + W[i, 1] * J[1, k] + W[i, 2] * J[2, k]
         for k in range(CALIBRATION):
-            WK[k] = W[i, 0] * K[0, k] + W[i, 1] * K[1, k] + W[i, 2] * K[2, k]
-        for a in range(6):
-            total.b[a] += J[i, a] * e
-            for k in range(6):
-                total.H[a, k] += J[i, a] * (W[i, 0] * J[0, k] + W[i, 1] * J[1, k] + W[i, 2] * J[2, k])
-            for k in range(CALIBRATION):
-                total.C[a, k] += J[i, a] * WK[k]
-        for a in range(CALIBRATION):
-            total.s[a] += K[i, a] * e
-            for k in range(CALIBRATION):
-                total.G[a, k] += K[i, a] * WK[k]
+            WK[i, k] = W[i, 0] * K[0, k] + W[i, 1] * K[1, k] + W[i, 2] * K[2, k]
+    for a in range(6):
+        total.b[a] += WJ[0, a] * r[0] + WJ[1, a] * r[1] + WJ[2, a] * r[2]
+        for k in range(6):
+            total.H[a, k] += J[0, a] * WJ[0, k] + J[1, a] * WJ[1, k] + J[2, a] * WJ[2, k]
+        for k in range(CALIBRATION):
+            total.C[a, k] += J[0, a] * WK[0, k] + J[1, a] * WK[1, k] + J[2, a] * WK[2, k]
+    for a in range(CALIBRATION):
+        total.s[a] += WK[0, a] * r[0] + WK[1, a] * r[1] + WK[2, a] * r[2]
+        for k in range(CALIBRATION):
+            total.G[a, k] += K[0, a] * WK[0, k] + K[1, a] * WK[1, k] + K[2, a] * WK[2, k]
 
 
-@kernel
+@kernel(forceinline=True)
 def _scale_and_subtract(scales: F64, J: F64, A: F64, K: F64) -> None:
     """Express K (3, 12) in units of `scales`; and subtract J A, since a landmark moves with the keyframes that observed it, whose mean error by the
     calibration is A (6, 12) as that of the camera."""
     for i in range(3):
         for k in range(CALIBRATION):
-            K[i, k] *= scales[k]
-        for a in range(6):
-            for k in range(CALIBRATION):
-                K[i, k] -= J[i, a] * A[a, k]
+            moved = J[i, 0] * A[0, k] + J[i, 1] * A[1, k] + J[i, 2] * A[2, k] + J[i, 3] * A[3, k] + J[i, 4] * A[4, k] + J[i, 5] * A[5, k]
+            K[i, k] = K[i, k] * scales[k] - moved
 
 
-@kernel
+@kernel(forceinline=True)
 def _to_keyframe(R: F64, t: F64, plane: F64, out: F64) -> None:
     """Move a plane (4,) of the world into the frame of a pose R, t."""
     out[3] = plane[3]
@@ -141,7 +141,7 @@ def _to_keyframe(R: F64, t: F64, plane: F64, out: F64) -> None:
         out[3] += plane[i] * t[i]
 
 
-@kernel
+@kernel(forceinline=True)
 def _add_point_error(q: F64, of_plane: F64, Q: F64, twist: F64, camera: F64, width: int, height: int, D: F64, E: F64, K: F64) -> None:
     """Add `D Q dq/dθ` to K (3, 12): the error of a landmark as a keyframe saw it, q (3,) in its frame, with Q from that frame to the camera's and
     D = dr/dp; `of_plane` (4,) is the surface there. E (3, 12) is overwritten."""
@@ -155,7 +155,7 @@ def _add_point_error(q: F64, of_plane: F64, Q: F64, twist: F64, camera: F64, wid
             K[i, k] += u * E[0, k] + v * E[1, k] + w * E[2, k]
 
 
-@kernel
+@kernel(forceinline=True)
 def _point_calibration_jacobian(
     R: F64, world: F64, p: F64, surface: F64, observers: I32, keyframes: Keyframes, twist: F64, camera: F64, width: int, height: int,
     D: F64, K: F64, A: F64,
@@ -188,7 +188,7 @@ def _point_calibration_jacobian(
     return True
 
 
-@kernel
+@kernel(forceinline=True)
 def _local(R: F64, t: F64, world: F64, out: F64) -> None:
     """`out = Rᵀ (world - t)`."""
     x, y, z = world[0] - t[0], world[1] - t[1], world[2] - t[2]
@@ -196,7 +196,7 @@ def _local(R: F64, t: F64, world: F64, out: F64) -> None:
         out[k] = R[0, k] * x + R[1, k] * y + R[2, k] * z
 
 
-@kernel
+@kernel(forceinline=True)
 def _plane_then(surface: F64, Q: F64, p: F64, q: F64, out: F64) -> None:
     """Move the plane of a point from the camera's frame, where the point is p, into its keyframe's, where it is q; NaN through the centre."""
     out[3] = surface[3]
@@ -215,7 +215,7 @@ def _add_points(
 ) -> None:  # fmt: skip
     """Add the inliers among the points; `surfaces` (n, 4) are the planes that they lie on, in the camera frame (NaN: none)."""
     p, r, D, J = np.empty(3), np.empty(3), np.zeros((3, 3)), np.empty((3, 6))
-    K, A = np.empty((3, CALIBRATION)), np.empty((6, CALIBRATION))
+    K, A, WJ, WK = np.empty((3, CALIBRATION)), np.empty((6, CALIBRATION)), np.empty((3, 6)), np.empty((3, CALIBRATION))
     for i in range(len(flags)):
         if not flags[i]:
             continue
@@ -226,10 +226,10 @@ def _add_points(
         if _point_calibration_jacobian(R, world, p, surfaces[i], observers[i], keyframes, twist, camera, width, height, D, K, A):
             pose_jacobian(D, 3, p, J)
             _scale_and_subtract(scales, J, A, K)
-            _add(J, W[i], K, r, total)
+            _add(J, W[i], K, r, WJ, WK, total)
 
 
-@kernel
+@kernel(forceinline=True)
 def _in_view(p: F64, camera: F64, width: int, height: int) -> bool:
     if not p[2] > NEAR_M:
         return False
@@ -291,18 +291,18 @@ def _add_planes(
     R: F64, t: F64, camera: F64, width: int, height: int, scales: F64, twist: F64, planes: PlaneTerms, W: F64, flags: U8, samples: F32,
     observers: I32, keyframes: Keyframes, total: Equations,
 ) -> None:  # fmt: skip
-    """Add the inliers among the identical planes; `samples` (p, n, 3) are points on them, world."""
+    """Add the inliers among the identical planes, the first of the planes; `samples` (p, n, 3) are points on them, world."""
     r, B, J = np.empty(3), np.empty((3, 2)), np.empty((3, 6))
-    K, A = np.empty((3, CALIBRATION)), np.empty((6, CALIBRATION))
-    for i in range(len(flags)):
-        if not flags[i] or planes.kinds[i] != SAME:
+    K, A, WJ, WK = np.empty((3, CALIBRATION)), np.empty((6, CALIBRATION)), np.empty((3, 6)), np.empty((3, CALIBRATION))
+    for i in range(len(samples)):
+        if not flags[i]:
             continue
         plane = planes.coefficients[i]
         tangent_columns(planes.observed[i], B)
         plane_residual(SAME, R, t, plane, planes.observed[i], B, r, J)
         if _plane_calibration_jacobian(R, t, plane, samples[i], observers[i], keyframes, twist, camera, width, height, B, K, A):
             _scale_and_subtract(scales, J, A, K)
-            _add(J, W[i], K, r, total)
+            _add(J, W[i], K, r, WJ, WK, total)
 
 
 @kernel
@@ -324,6 +324,39 @@ def calibration_equations(
     _add_points(R, t, camera, width, height, scales, twist, points, weights.points, flags.points, surfaces, observers.points, keyframes, total)
     _add_planes(R, t, camera, width, height, scales, twist, planes, weights.planes, flags.planes, samples, observers.planes, keyframes, total)
     return total
+
+
+@kernel
+def moved_sensitivity(T: F64, previous: F64, sensitivity: F64) -> F64:
+    """Return the error of a pose T (4, 4) by the calibration (6, 12) as it is for a camera that moved there with the `previous` one."""
+    to_camera = np.empty((6, 6))
+    adjoint_between(T, previous, to_camera)
+    return matmul(to_camera, sensitivity)
+
+
+@kernel
+def keyframes_at(T: F64, poses: F64, twists: F64, sensitivities: F64) -> Keyframes:
+    """Return keyframes with poses (m, 4, 4), velocities (m, 6) and errors by the calibration (m, 6, 12) of their own, for a camera at T (4, 4)."""
+    errors = np.empty(sensitivities.shape)
+    for k in range(len(poses)):
+        errors[k] = moved_sensitivity(T, poses[k], sensitivities[k])
+    return Keyframes(np.ascontiguousarray(poses[:, :3, :3]), np.ascontiguousarray(poses[:, :3, 3]), twists, errors)
+
+
+@kernel
+def sensitivity_and_evidence(equations: Equations, prior: F64, before: F64) -> tuple[F64, F64, F64]:
+    """Return the error of a pose by the calibration (6, 12), `before` being that of its prior of information `prior` (6, 6); and the information
+    (12, 12) and score (12,) on the calibration that the residuals leave beside the pose."""
+    to_pose = inverse_positive(equations.H + prior)
+    sensitivity = matmul(to_pose, matmul(prior, before) - equations.C)
+    share = matmul(to_pose, equations.C)
+    information, score = equations.G.copy(), equations.s.copy()
+    for a in range(CALIBRATION):
+        for i in range(6):
+            score[a] -= share[i, a] * equations.b[i]
+            for k in range(CALIBRATION):
+                information[a, k] -= 0.5 * (share[i, a] * equations.C[i, k] + equations.C[i, a] * share[i, k])
+    return sensitivity, information, score
 
 
 @kernel

@@ -1,4 +1,5 @@
-"""Kernels of the Lie group SO(3): exponential (Rodrigues' formula), also applied from the left, and logarithm; as in `pipeline.core.geometry`."""
+"""Kernels of the Lie groups SO(3): exponential (Rodrigues' formula), also applied from the left, and logarithm; and SE(3): adjoint; as in
+`pipeline.core.lie`."""
 # mypy: disable-error-code="arg-type, assignment, index, return-value"
 
 from __future__ import annotations
@@ -60,3 +61,18 @@ def log_so3_each(R: F64) -> F64:
     for i in range(len(R)):
         out[i, 0], out[i, 1], out[i, 2] = log_so3(R[i])
     return out
+
+
+@kernel
+def adjoint_between(T: F64, other: F64, out: F64) -> None:
+    """Fill the adjoint (6, 6) of `T⁻¹ · other`, two poses (4, 4): it takes xi of a camera at `other` to that of a camera at T that moves with it."""
+    out[:] = 0.0
+    t = np.empty(3)
+    for i in range(3):
+        t[i] = T[0, i] * (other[0, 3] - T[0, 3]) + T[1, i] * (other[1, 3] - T[1, 3]) + T[2, i] * (other[2, 3] - T[2, 3])
+        for k in range(3):
+            out[i, k] = T[0, i] * other[0, k] + T[1, i] * other[1, k] + T[2, i] * other[2, k]
+    for i, j, m in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        for k in range(3):
+            out[3 + i, 3 + k] = out[i, k]
+            out[i, 3 + k] = t[j] * out[m, k] - t[m] * out[j, k]

@@ -11,13 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from trihedron.pipeline.core.linalg import cholesky, eigh, inv, matmul
-from trihedron.pipeline.core.linalg_kernels import inverse_positive
 from trihedron.pipeline.core.types import F64, U8, Camera
-from trihedron.plugins.shared.pose_optimizer_kernels import INLIER, ROUNDS, Flags, Groups, add_scores, solve
+from trihedron.plugins.shared.pose_optimizer_kernels import INLIER, ROUNDS, Flags, solve
 from trihedron.plugins.shared.residuals_kernels import LineTerms, PlaneTerms, PointTerms
 
 PLANE_SLACK = 4.0  # multiplies the planes' gates when a direction would become unobservable without the planes beyond them
-LEAST_FREEDOM = 1.0  # degrees of freedom with which the scale of the residuals can be estimated
 LANDMARK_SCORE = 1, 2, 5  # weight of a point, a line and a plane where inliers are counted
 Terms = tuple[PointTerms, LineTerms, PlaneTerms]
 NO_POINTS = PointTerms(np.empty((0, 3)), np.empty((0, 3, 3)), np.empty((0, 2)), np.empty(0), np.empty(0), np.empty(0))
@@ -85,30 +83,6 @@ def classify_terms(
     flags = _all_inliers(terms)
     solve(np.array([T_world_camera, T_world_camera]), np.eye(6), camera.intrinsics, *terms, flags, 6, 0, 1.0)
     return flags
-
-
-def grouped_equations(T_world_camera: F64, camera: Camera, terms: Terms, flags: Flags, groups: Groups, count: int) -> tuple[F64, F64]:
-    """Normal equations of the terms of each group that are not outliers: information (count, 6, 6) and score (count, 6) of xi."""
-    H, g = np.zeros((count, 6, 6)), np.zeros((count, 6))
-    R, t = (np.ascontiguousarray(part) for part in (T_world_camera[:3, :3], T_world_camera[:3, 3]))
-    add_scores(R, t, camera.intrinsics, *terms, flags, groups, H, g)
-    return np.tril(H) + np.tril(H, -1).transpose(0, 2, 1), g
-
-
-def residual_scale(information: F64, scores: F64) -> float | None:
-    """Variance of the scores (k, 6) of groups, whose terms may err alike, relative to that stated by their information (k, 6, 6); None where they are
-    too few to tell.
-
-    With independent errors of the stated covariance the score of group k, less its share of the pose's adjustment, has covariance
-    `H_k - H_k H⁻¹ H_k`. The cluster-robust ("sandwich") estimate of the pose's covariance (Liang and Zeger, Biometrika 1986) exceeds `H⁻¹` by this
-    factor, averaged over directions."""
-    inverse = inverse_positive(information.sum(axis=0))
-    share = matmul(information, inverse)
-    freedom = 6.0 - float(np.einsum("kij,kji->", share, share))
-    if not inverse.any() or freedom < LEAST_FREEDOM:
-        return None
-    scores = scores - matmul(share, scores.sum(axis=0))
-    return float(np.einsum("ki,ij,kj->", scores, inverse, scores)) / freedom
 
 
 def _all_inliers(terms: Terms) -> Flags:

@@ -7,13 +7,15 @@ import pytest
 
 from trihedron.pipeline.core.table import Column, Table
 from trihedron.pipeline.core.types import Map, Pose
+from trihedron.plugins.pose.map_alignment_kernels import number_keyframes
 from trihedron.plugins.pose.world_uncertainty import (
-    covariance_of_keyframes,
     keyframe_covariance,
     keyframe_uncertainty,
     propagate_world_covariance,
 )
-from trihedron.plugins.shared.pose_optimizer import residual_scale
+from trihedron.plugins.pose.world_uncertainty_kernels import covariance_of_keyframes, residual_scale
+from trihedron.plugins.shared.calibration_error_kernels import Observers
+from trihedron.plugins.shared.pose_optimizer_kernels import Groups
 
 
 def equations(rng, groups, common):
@@ -34,8 +36,15 @@ def test_scale_of_residuals_shows_what_those_of_one_keyframe_share(common, expec
 
 def test_scale_of_residuals_is_unknown_for_one_keyframe_and_without_any():
     rng = np.random.default_rng(1)
-    assert residual_scale(*equations(rng, 1, 0.0)) is None
-    assert residual_scale(np.zeros((0, 6, 6)), np.zeros((0, 6))) is None
+    assert np.isnan(residual_scale(*equations(rng, 1, 0.0)))
+    assert np.isnan(residual_scale(np.zeros((0, 6, 6)), np.zeros((0, 6))))
+
+
+def test_keyframes_of_landmarks_are_numbered_in_the_order_of_time():
+    created = Groups(*(np.array(rows, np.int32) for rows in ([7, 2, 7], [], [5])))
+    observed = Observers(np.array([[7, -1], [2, 9], [7, -1]], np.int32), np.array([[5, -1]], np.int32))
+    assert number_keyframes(12, created, observed).tolist() == [2, 5, 7, 9]
+    assert [part.tolist() for part in (*created, *observed)] == [[2, 0, 2], [], [1], [[2, -1], [0, 3], [2, -1]], [[1, -1]]]
 
 
 def test_average_of_a_random_walk():
