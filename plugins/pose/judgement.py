@@ -179,7 +179,7 @@ def _is_observed(problem: MapAlignment, points: I32, T_world_camera: F64) -> NDA
 
 def repeated_images(previous: Pose, tracks: Tracks | None, keypoints: Keypoints, planes: Planes) -> int:
     """Return how many images in a row repeat the one before: every tracked key point and plane is bit-identical, which two images of a sensor never
-    are; or most key points are while the others move. Once two images in a row did so, the others need not move."""
+    are; or most key points are while the others move. Once two images in a row did so, few others need move, or none."""
     if tracks is None:
         return 0
     points, walls = keypoints.points_m[tracks.keypoints[:, 1]], planes.coefficients[tracks.planes[:, 1]]
@@ -196,10 +196,12 @@ def _most_repeat(before: F32, now: F32, moved: bool) -> bool:
     """Return whether most of these tracked key points (n, 3) are bit-identical, and the others move, or have `moved`."""
     same = (before == now).all(axis=1)
     others = np.isfinite(before[:, 2]) & np.isfinite(now[:, 2]) & ~same
-    if not SIGNIFICANT <= np.count_nonzero(others) < np.count_nonzero(same):
+    if np.count_nonzero(others) >= np.count_nonzero(same):
         return False
+    if moved or np.count_nonzero(others) < SIGNIFICANT:
+        return moved
     shifts = np.abs(before[others, :2] / before[others, 2:] - now[others, :2] / now[others, 2:]).sum(axis=1)
-    return moved or bool(np.median(shifts) > MOVED)
+    return bool(np.median(shifts) > MOVED)
 
 
 def _by_information(options: JudgementOptions, evidence: Evidence) -> TrackingStatus:
