@@ -50,7 +50,7 @@ class ViewOptions:
     view_width: Annotated[int, Range(16, 4096)] = 320  # px, about, to which images are reduced
     max_sigma_m: PositiveFloat = 0.05  # depth less certain than this is not used: a Kinect's beyond 4.2 m; a frame's planes say how certain it is
     views: Annotated[float, Range(1)] = 6.0  # of its quality, after which a view has nothing new to tell of a place
-    news: PositiveShare = 0.15  # share of new readings for which a view is kept
+    min_novelty: PositiveShare = 0.15  # share of new readings for which a view is kept
 
 
 def add_view(
@@ -65,7 +65,7 @@ def add_view(
     frame = with_measured_noise(frame, planes)
     points, weight = readings(frame, pose.T_world_camera, max(1, frame.camera.width // NOVELTY_COLUMNS), options.max_sigma_m)
     known = state.known.setdefault(pose.submap, Known(CELL_M))
-    if not len(points) or known.novelty(points, weight, options.views) < options.news:
+    if not len(points) or known.novelty(points, weight, options.views) < options.min_novelty:
         return None
     known.learn(points, weight)
     view = view_of(frame, planes, pose, map, options.view_width, options.max_sigma_m)

@@ -207,7 +207,7 @@ def test_one_view_gives_the_area_that_it_shows(name):
         ("planar_polygon", {"snap_m": 0.0}, "snap_m"),
         ("planar_greedy", {"multiplier": 1.0}, "multiplier"),
         ("surfels", {"side_px": 30}, "side_px"),
-        ("surfels", {"news": 0.0}, "news"),
+        ("surfels", {"min_novelty": 0.0}, "min_novelty"),
     ],
 )
 def test_options_out_of_range_are_refused(name, options, said):
