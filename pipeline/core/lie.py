@@ -58,7 +58,7 @@ def exp_se3(xi: F64) -> F64:
 
 def log_se3(T: F64) -> F64:
     """Map a (4, 4) rigid motion to its (6,) twist (rho, phi); inverse of `exp_se3`."""
-    (x, y, z), (a, b, c) = log_so3(T[:3, :3]).tolist(), T[:3, 3].tolist()  # plain numbers: NumPy takes ten times as long for so few
+    (x, y, z), (a, b, c) = log_so3(T[:3, :3]).tolist(), T[:3, 3].tolist()  # plain numbers: NumPy takes nine times as long for so few
     angle2 = x * x + y * y + z * z
     half = 0.5 * math.sqrt(angle2)
     factor = 1.0 / 12.0 + angle2 / 720.0 if angle2 < 1e-4 else (1.0 - half / math.tan(half)) / angle2

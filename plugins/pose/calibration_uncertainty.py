@@ -77,7 +77,7 @@ def with_calibration(pose: Pose, previous: Pose, problem: MapAlignment, flags: F
 
 
 def keyframes_seen(pose: Pose, map: Map, rows: I32, poses: F64) -> Keyframes:
-    """Return the keyframes in these rows (k,) of the map, of which the poses are (k, 4, 4), as the camera's calibration bends them."""
+    """Return the keyframes in rows (k,) of the map, with poses (k, 4, 4), their velocities, and their errors by the calibration for the camera."""
     sensitivities, twists = map.keyframes.columns_at(rows, "sensitivity", "twist")
     twists[rows == pose.reference] = pose.reference_twist
     return keyframes_at(constant(pose.T_world_camera, np.float64), poses, twists, sensitivities)

@@ -179,7 +179,7 @@ def _is_observed(problem: MapAlignment, points: I32, T_world_camera: F64) -> NDA
 
 def repeated_images(previous: Pose, tracks: Tracks | None, keypoints: Keypoints, planes: Planes) -> int:
     """Return how many images in a row repeat the one before: every tracked key point and plane is bit-identical, which two images of a sensor never
-    are; or most key points are while the others move. Once two images in a row did so, few others need move, or none."""
+    are; or most key points are while the others move. After two such images in a row it is enough that most key points are."""
     if tracks is None:
         return 0
     points, walls = keypoints.points_m[tracks.keypoints[:, 1]], planes.coefficients[tracks.planes[:, 1]]

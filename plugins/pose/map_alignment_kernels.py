@@ -15,25 +15,18 @@ from trihedron.plugins.shared.pose_optimizer_kernels import Groups
 def number_keyframes(count: int, created: Groups, observed: Observers) -> I32:
     """Replace rows of `count` keyframes by their numbers among the rows (k,) that occur, which are returned, increasing; -1 stays."""
     number = np.full(count, -1, np.int32)
-    for rows in (created.points, created.lines, created.planes):
+    columns = created.points, created.lines, created.planes, observed.points.reshape(-1), observed.planes.reshape(-1)
+    for rows in columns:
         for i in range(len(rows)):
-            number[rows[i]] = 0
-    for pairs in (observed.points, observed.planes):
-        for i in range(pairs.shape[0]):
-            for j in range(pairs.shape[1]):
-                if pairs[i, j] >= 0:
-                    number[pairs[i, j]] = 0
+            if rows[i] >= 0:
+                number[rows[i]] = 0
     out = np.flatnonzero(number == 0).astype(np.int32)
     for k in range(len(out)):
         number[out[k]] = k
-    for rows in (created.points, created.lines, created.planes):
+    for rows in columns:
         for i in range(len(rows)):
-            rows[i] = number[rows[i]]
-    for pairs in (observed.points, observed.planes):
-        for i in range(pairs.shape[0]):
-            for j in range(pairs.shape[1]):
-                if pairs[i, j] >= 0:
-                    pairs[i, j] = number[pairs[i, j]]
+            if rows[i] >= 0:
+                rows[i] = number[rows[i]]
     return out
 
 

@@ -26,6 +26,7 @@ from trihedron.plugins.shared.residuals_kernels import (
     plane_residual,
     point_residual,
     pose_jacobian,
+    to_camera,
 )
 
 EXPECTATIONS = 8  # iterations for the common scale
@@ -167,7 +168,7 @@ def _point_calibration_jacobian(
     for k in observers:
         if k < 0:
             continue
-        _local(keyframes.R[k], keyframes.t[k], world, q)
+        to_camera(keyframes.R[k], keyframes.t[k], world, q)
         if not q[2] > NEAR_M:
             continue
         for a in range(3):
@@ -186,14 +187,6 @@ def _point_calibration_jacobian(
             K[i, k] = K[i, k] / seen - (E[i, k] if i < rows else 0.0)
     A /= seen
     return True
-
-
-@kernel(forceinline=True)
-def _local(R: F64, t: F64, world: F64, out: F64) -> None:
-    """`out = Rᵀ (world - t)`."""
-    x, y, z = world[0] - t[0], world[1] - t[1], world[2] - t[2]
-    for k in range(3):
-        out[k] = R[0, k] * x + R[1, k] * y + R[2, k] * z
 
 
 @kernel(forceinline=True)
@@ -220,7 +213,7 @@ def _add_points(
         if not flags[i]:
             continue
         world = points.positions_m[i]
-        _local(R, t, world, p)
+        to_camera(R, t, world, p)
         if not point_residual(p, points.pixels[i], points.depth_m[i], camera, r, D):
             continue
         if _point_calibration_jacobian(R, world, p, surfaces[i], observers[i], keyframes, twist, camera, width, height, D, K, A):
@@ -254,7 +247,7 @@ def _plane_calibration_jacobian(
     A[:] = 0.0
     for j in range(len(samples)):
         point = samples[j].astype(np.float64)
-        _local(R, t, point, p)
+        to_camera(R, t, point, p)
         if not _in_view(p, camera, width, height):
             continue
         mean[:], count = 0.0, 0
@@ -262,7 +255,7 @@ def _plane_calibration_jacobian(
             k = observers[o]
             if k < 0:
                 continue
-            _local(keyframes.R[k], keyframes.t[k], point, q)
+            to_camera(keyframes.R[k], keyframes.t[k], point, q)
             if not _in_view(q, camera, width, height):
                 continue
             plane_point_error(q, then[o], keyframes.twists[k], camera, width, height, E)
@@ -329,9 +322,9 @@ def calibration_equations(
 @kernel
 def moved_sensitivity(T: F64, previous: F64, sensitivity: F64) -> F64:
     """Return the error of a pose T (4, 4) by the calibration (6, 12) as it is for a camera that moved there with the `previous` one."""
-    to_camera = np.empty((6, 6))
-    adjoint_between(T, previous, to_camera)
-    return matmul(to_camera, sensitivity)
+    adjoint = np.empty((6, 6))
+    adjoint_between(T, previous, adjoint)
+    return matmul(adjoint, sensitivity)
 
 
 @kernel
