@@ -41,6 +41,8 @@ def run(out, kind, options, frames, *cover):
 def test_a_small_camera_covered_for_ten_frames_is_lost_just_then(tmp_path):
     metrics, poses = run(tmp_path / "run", "synthetic", {"width": 320, "height": 240}, "0:32", "dataset.cover=14:24")
     assert [index for index, pose in poses.items() if pose.status == "lost"] == list(range(14, 24))
+    assert [poses[index].status for index in (24, 25, 26)] == ["degraded", "degraded", "ok"]
+    assert poses[24].reason.startswith("found again, which 1 of 3 frames in a row confirm: ")
     assert metrics["status"]["lost"] == 10 and metrics["final"]["ate_rmse_m"] < 0.005
     assert len((tmp_path / "run" / "trajectory.txt").read_text().splitlines()) == 1 + 22
 

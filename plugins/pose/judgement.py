@@ -9,8 +9,8 @@ status, with its figures:
   points and planes disagreed than usual, planes turn as the camera does (`contradiction.py`), and the residuals so far do not contradict the
   camera's calibration (`calibration_uncertainty.py`). A frame that comes after a contradiction, and that the map does not support, is lost.
 - **Continuity**: the rotation was measured, and the frame continues the previous one, or the map knows its details: of a place that is built alike,
-  walls and lines agree, and points do not. A camera that was found again keeps finding what was mapped before it was lost; in a room like the one it
-  was taken to be in, it does until it leaves.
+  walls and lines agree, and points do not. A jump is proven by the map alone, and the place where a camera was found again by three frames in a row.
+  It keeps finding what was mapped before it was lost; in a room like the one it was taken to be in, it does until it leaves.
 - **Freshness**: an image that repeats the one before, wholly or for the most part, measures nothing.
 
 Limits are options of `pose=refine`, or the constants below. `trihedron benchmark honesty` counts the clean frames that each test degrades (false
@@ -24,8 +24,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trihedron.pipeline.core.geometry import invert, transform
+from trihedron.pipeline.core.lie import log_so3
+from trihedron.pipeline.core.linalg import matmul, norm, solve
 from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat, Share
-from trihedron.pipeline.core.types import DEGRADED, F32, F64, I32, LOST, OK, Keypoints, Planes, Pose, Rotation, Tracks, Translation
+from trihedron.pipeline.core.types import DEGRADED, F64, I32, LOST, OK, Keypoints, Planes, Pose, Rotation, Tracks, Translation
 from trihedron.plugins.mapping.submaps import is_elsewhere
 from trihedron.plugins.pose.calibration_uncertainty import contradicted_calibration
 from trihedron.plugins.pose.dynamic_objects import MovingOptions, Selection, status_with_static
@@ -39,8 +41,8 @@ BY_CHANCE = 0.15  # of DETAILED matches that agree by chance: after a jump at mo
 MISSING_POINTS = 1000.0  # mapped before the camera was lost, that their missing share is averaged over
 SAME_M, SAME_SHARE = 0.05, 0.03  # and share of its depth, from the plane that is observed there, within which a point lies on it
 SAME_VIEW, SAME_DISTANCE = np.cos(np.deg2rad(30.0)), 1.5  # between views of a point, and ratio of their distances, that show the same of it
-SIGNIFICANT = 10  # key points that move while most repeat, which at most 6 % of five sequences do, and where half the image froze 80 %
-MOVED = 0.001  # that such points move in the image, as a tangent: half a pixel. The images of a camera at rest may be alike
+JUMP_SIGMAS2 = 16.3  # Mahalanobis distance² (0.999 quantile of χ² with 3 dof) from a predicted rotation beyond which the camera has jumped
+CONFIRMING = 3  # frames in a row, each ok by itself, from the third of which on a camera that was found again is ok
 BLURRED_PX = 1.0  # blur that is worth a word: with more the covariance is half as large again
 
 
@@ -87,6 +89,8 @@ def reason_to_be_lost(options: JudgementOptions, evidence: Evidence, start_statu
         return f"{doubt}; and now {agree} with the map agree"
     if evidence.rotation.source == "prediction" and not tracked:
         return f"the rotation was not measured, and {agree} with the map agree"
+    if evidence.rotation.source == "prediction" and (jump_deg := _jump_deg(evidence)) and not is_found_again(options, evidence):
+        return f"the rotation was not measured, the map turns it by {jump_deg:.0f}°, and does not determine the pose by itself: {agree} agree"
     continued = int(evidence.translation.inliers[0]), inliers.inliers[0]
     if start_status != LOST and _is_another_place(options, evidence.problem, max(continued)):
         known = f"{continued[0]} key points continue the previous frame and {continued[1]} are in the map"
@@ -120,12 +124,19 @@ def status_by_images(status: TrackingStatus, evidence: Evidence, repeats: int) -
     return status
 
 
-def judge_by_run(pose: Pose) -> Pose:
+def judge_by_run(pose: Pose, previous: Pose) -> Pose:
     """Degrade an ok pose that contradicts the run so far: its matched points have disagreed for ten frames, planes turned otherwise, what was mapped
-    before the latest loss is not there, or the residuals contradict the calibration."""
+    before the latest loss is not there, or the residuals contradict the calibration; and one that too few frames since that loss have confirmed."""
     tests = contradiction_so_far, _found_elsewhere, contradicted_calibration
     reason = next(filter(None, (test(pose) for test in tests)), "") if pose.status == OK else ""
-    return replace(pose, status=DEGRADED, reason=reason) if reason else pose
+    pose = replace(pose, status=DEGRADED, reason=reason) if reason else pose
+    if not pose.lost_from or previous.confirmations == CONFIRMING:
+        return replace(pose, confirmations=previous.confirmations)
+    pose = replace(pose, confirmations=previous.confirmations + 1 if pose.status == OK else 0)
+    if pose.status != OK or pose.confirmations == CONFIRMING:
+        return pose
+    reason = f"found again, which {pose.confirmations} of {CONFIRMING} frames in a row confirm: {pose.reason}"
+    return replace(pose, status=DEGRADED, reason=reason)
 
 
 def with_disagreement(pose: Pose, previous: Pose, inliers: InlierStatistics, static: Selection | None) -> Pose:
@@ -138,9 +149,9 @@ def with_disagreement(pose: Pose, previous: Pose, inliers: InlierStatistics, sta
 
 
 def since_loss(pose: Pose, previous: Pose) -> Pose:
-    """Give a pose the previous one's `lost_from` and `missing`; the first lost one begins them anew."""
+    """Give a pose the previous one's `lost_from`, `missing` and `confirmations`; the first lost one begins them anew."""
     if pose.status != LOST:
-        return replace(pose, lost_from=previous.lost_from, missing=previous.missing) if previous.lost_from else pose
+        return replace(pose, lost_from=previous.lost_from, missing=previous.missing, confirmations=previous.confirmations)
     return replace(pose, lost_from=previous.lost_from if previous.status == LOST else pose.index)
 
 
@@ -179,29 +190,19 @@ def _is_observed(problem: MapAlignment, points: I32, T_world_camera: F64) -> NDA
 
 def repeated_images(previous: Pose, tracks: Tracks | None, keypoints: Keypoints, planes: Planes) -> int:
     """Return how many images in a row repeat the one before: every tracked key point and plane is bit-identical, which two images of a sensor never
-    are; or most key points are while the others move. After two such images in a row it is enough that most key points are."""
+    are; or most key points with depth are, and a plane, which is computed from thousands of depths."""
     if tracks is None:
         return 0
-    points, walls = keypoints.points_m[tracks.keypoints[:, 1]], planes.coefficients[tracks.planes[:, 1]]
-    whole = len(points) + len(walls) and np.array_equal(tracks.points_m, points, True) and np.array_equal(tracks.coefficients, walls, True)
-    return previous.repeats + 1 if whole or _most_repeat(tracks.points_m, points, previous.repeats > 1) else 0
+    before, points, walls = tracks.points_m, keypoints.points_m[tracks.keypoints[:, 1]], planes.coefficients[tracks.planes[:, 1]]
+    whole = len(points) + len(walls) and np.array_equal(before, points, True) and np.array_equal(tracks.coefficients, walls, True)
+    with_depth = np.count_nonzero(np.isfinite(before[:, 2]) & np.isfinite(points[:, 2]))
+    partly = (tracks.coefficients == walls).all(axis=1).any() and 2 * np.count_nonzero((before == points).all(axis=1)) > with_depth
+    return previous.repeats + 1 if whole or partly else 0
 
 
 def _repeating(repeats: int) -> str:
     """Return why so many images in a row that repeat the one before are no measurement; empty for one, which a Kinect repeats now and then."""
     return "the images repeat the previous frame bit for bit, wholly or in part: at rest, or frozen" if repeats > 1 else ""
-
-
-def _most_repeat(before: F32, now: F32, moved: bool) -> bool:
-    """Return whether most of these tracked key points (n, 3) are bit-identical, and the others move, or have `moved`."""
-    same = (before == now).all(axis=1)
-    others = np.isfinite(before[:, 2]) & np.isfinite(now[:, 2]) & ~same
-    if np.count_nonzero(others) >= np.count_nonzero(same):
-        return False
-    if moved or np.count_nonzero(others) < SIGNIFICANT:
-        return moved
-    shifts = np.abs(before[others, :2] / before[others, 2:] - now[others, :2] / now[others, 2:]).sum(axis=1)
-    return bool(np.median(shifts) > MOVED)
 
 
 def _by_information(options: JudgementOptions, evidence: Evidence) -> TrackingStatus:
@@ -231,6 +232,13 @@ def _is_another_place(options: JudgementOptions, problem: MapAlignment, continue
     with_depth = int(np.count_nonzero(np.isfinite(problem.keypoints.points_m[:, 2])))
     expected = min(with_depth, len(problem.matches.visible_points))
     return expected >= DETAILED and continued < options.min_continued * with_depth
+
+
+def _jump_deg(evidence: Evidence) -> float:
+    """Return by how much the pose is turned from a predicted rotation where that is more than the prediction allows for; 0 elsewhere."""
+    rotation = evidence.rotation
+    phi = log_so3(matmul(rotation.R_world_camera.T, evidence.solution.T_world_camera[:3, :3]))
+    return float(np.rad2deg(norm(phi))) if matmul(phi, solve(rotation.covariance, phi)) > JUMP_SIGMAS2 else 0.0
 
 
 def _found_elsewhere(pose: Pose) -> str:

@@ -267,7 +267,7 @@ def test_what_was_mapped_before_the_camera_was_lost_is_still_there(world, map):
     """A frame that matches what it should of the map, and one that matches a tenth of it, after a loss in frame 7 and after none."""
     start, features, matches = matched(world, map)
     tenth = dataclasses.replace(matches, keypoints=matches.keypoints[::10])
-    before = dataclasses.replace(pose_of(camera_at(STEP - 1), STEP - 1), lost_from=7, missing=0.96)
+    before = dataclasses.replace(pose_of(camera_at(STEP - 1), STEP - 1), lost_from=7, missing=0.96, confirmations=3)
 
     def refined(found, previous):
         return Refine()(world.frame(STEP).camera, *start, None, found, *features, previous, map, None)
