@@ -1,8 +1,9 @@
 """Compile the kernels of the default graph in two processes, before the first run or when `trihedron compile` is called.
 
 numba compiles one function at a time in a process, and knows the types of the arguments only from a call. So two processes run the graph on small
-images of the built-in room, one as far as the Manhattan frame, the other with points alone but to the end, then with all stages. What both need is
-compiled by the one that comes to it first, and loaded from the cache by the other.
+images of the built-in room: one as far as the Manhattan frame, then to bundle adjustment, of poses that are not refined; the other with points alone
+to refined poses, then with all stages. What both need is compiled by the one that comes to it first, and loaded from the cache by the other. Either
+takes about as long, and neither comes to a part while the other is at it.
 """
 
 from __future__ import annotations
@@ -32,20 +33,22 @@ WHOLE = tuple(f"dataset.{word}" for word in SMALL)  # all frames of the room: so
 ROOM = (*WHOLE, "dataset.length=40")
 LOST = ("dataset=faults", *(f"+dataset.options.{word}" for word in SMALL), "dataset.cover=10:20")
 DIRECTIONS = (*ROOM, "dataset.frames=0:5", "outputs=[manhattan]")
-POINTS = (*ROOM, "normals=none", "planes=none", "lines=none")
+ALONE = ("normals=none", "planes=none", "lines=none", "graph.tracks.manhattan=null", "graph.tracks.previous_manhattan=null")  # points
+POINTS = (*ROOM, *ALONE, "rotation=constant_velocity", "bundle=none")
+UNREFINED = (*ROOM, "pose=none")
 SURFACE = (*ROOM, "outputs=[trajectory,surface]")
 FOUND, UNKNOWN = (*LOST, "dataset.frames=0:100"), (*LOST, "dataset.frames=0:60", "+dataset.options.texture=false")
-TRACKING = ((DIRECTIONS,), (POINTS, WHOLE))  # runs of each process before a run, which compiles what is left as it comes to it
+TRACKING = ((DIRECTIONS, UNREFINED), (POINTS, WHOLE))  # runs of each process before a run, which compiles what is left as it comes to it
 TURN = (*WHOLE, "dataset.length=300", "dataset.motion=pan")  # round which a loop is closed
 ALL = (
-    (DIRECTIONS, SURFACE),
+    (DIRECTIONS, UNREFINED, SURFACE),
     (POINTS, WHOLE, FOUND, UNKNOWN, TURN),
 )  # and before a live run: also what a surface, a loss, the way back and a loop need
 BUILDING, LIVE = (*ROOM, "outputs=[trajectory,building]"), (*ROOM, "live=true")
-AGAIN = ("replay={folder}/0/run.mcap", "only=[surface]", "outputs=[trajectory,surface]")  # of the first run of a process
-WHEEL = ((DIRECTIONS, SURFACE), (ROOM, AGAIN, BUILDING, LIVE, *ALL[1]))  # and for a wheel: also buildings and replays
+AGAIN = ("replay={folder}/1/run.mcap", "only=[surface]", "outputs=[trajectory,surface]")  # of the second run of a process
+WHEEL = (ALL[0], (POINTS, ROOM, AGAIN, BUILDING, LIVE, *ALL[1][1:]))  # and for a wheel: also buildings and replays
 PARTS = {"tracking": TRACKING, "all": ALL, "wheel": WHEEL}
-FUNCTIONS = {"tracking": 810, "all": 1130, "wheel": 1320}  # compiled by both processes, about
+FUNCTIONS = {"tracking": 815, "all": 955, "wheel": 1030}  # compiled by both processes, about
 LATER = "of surfaces, loops, a loss and relocalisation"  # what `all` compiles after `tracking`
 NAMES = {"tracking": "of tracking", "all": f"of tracking, {LATER.removeprefix('of ')}", "wheel": "of all that a wheel brings"}
 SHORT = 150  # frames of a run that hardly closes a loop

@@ -13,8 +13,10 @@ import pytest
 
 from trihedron.pipeline.app import compilation
 from trihedron.pipeline.core import kernel as kernels
+from trihedron.pipeline.core.config import compose_run, graph_of
 from trihedron.pipeline.core.errors import TrihedronError
 from trihedron.pipeline.core.kernel import KernelCache, kernel, source_key
+from trihedron.pipeline.core.registry import plugin_class
 from trihedron.pipeline.run import warm_up
 
 ROOT = Path(__file__).parents[2]
@@ -146,6 +148,17 @@ def test_a_run_compiles_beforehand_what_its_kind_needs(compiled):
     compilation.compile_once(["dataset", *compilation.STAGES], frames=None)
     compilation.compile_once(["dataset", "keypoints"], frames=None)
     assert compiled == ["tracking", "all", "all", "all"]
+
+
+@pytest.mark.parametrize("what", compilation.PARTS)
+def test_what_the_two_processes_run_is_a_graph(what):
+    """All but the replay, which needs a recording. Until both run all stages, neither has what the other compiles: see the module's docstring."""
+    graphs = [[graph_of(compose_run(words)).stages for words in part if words != compilation.AGAIN] for part in compilation.PARTS[what]]
+    (directions, unrefined, *_), (points, *_) = graphs
+    assert "manhattan" in directions and "pose" not in directions
+    assert {"bundle", "manhattan"} <= set(unrefined) and unrefined["pose"].plugin == plugin_class("pose", "none")()
+    assert "pose" in points and "manhattan" not in points and points["bundle"].plugin == plugin_class("bundle", "none")()
+    assert all({"lines", "planes", "manhattan", "bundle", "pose"} <= set(stages) for part in graphs for stages in part[2:])
 
 
 def test_nothing_is_compiled_beforehand_twice_for_other_graphs_or_where_it_is_switched_off(compiled, monkeypatch):
