@@ -2,8 +2,8 @@
 
 numba compiles one function at a time in a process, and knows the types of the arguments only from a call. So two processes run the graph on small
 images of the built-in room: one as far as the Manhattan frame, then to bundle adjustment, of poses that are not refined; the other with points alone
-to refined poses, then with all stages. What both need is compiled by the one that comes to it first, and loaded from the cache by the other. Either
-takes about as long, and neither comes to a part while the other is at it.
+to refined poses, then with all stages. What both need is compiled by the one that comes to it first, and loaded from the cache by the other. Both
+take about as long, and neither comes to a part while the other compiles it.
 """
 
 from __future__ import annotations
@@ -33,8 +33,10 @@ WHOLE = tuple(f"dataset.{word}" for word in SMALL)  # all frames of the room: so
 ROOM = (*WHOLE, "dataset.length=40")
 LOST = ("dataset=faults", *(f"+dataset.options.{word}" for word in SMALL), "dataset.cover=10:20")
 DIRECTIONS = (*ROOM, "dataset.frames=0:5", "outputs=[manhattan]")
-ALONE = ("normals=none", "planes=none", "lines=none", "graph.tracks.manhattan=null", "graph.tracks.previous_manhattan=null")  # points
-POINTS = (*ROOM, *ALONE, "rotation=constant_velocity", "bundle=none")
+POINTS = (
+    *ROOM, "normals=none", "planes=none", "lines=none", "bundle=none", "rotation=constant_velocity",
+    "graph.tracks.manhattan=null", "graph.tracks.previous_manhattan=null",
+)  # fmt: skip
 UNREFINED = (*ROOM, "pose=none")
 SURFACE = (*ROOM, "outputs=[trajectory,surface]")
 FOUND, UNKNOWN = (*LOST, "dataset.frames=0:100"), (*LOST, "dataset.frames=0:60", "+dataset.options.texture=false")

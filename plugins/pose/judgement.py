@@ -9,7 +9,7 @@ status, with its figures:
   points and planes disagreed than usual, planes turn as the camera does (`contradiction.py`), and the residuals so far do not contradict the
   camera's calibration (`calibration_uncertainty.py`). A frame that comes after a contradiction, and that the map does not support, is lost.
 - **Continuity**: the rotation was measured, and the frame continues the previous one, or the map knows its details: of a place that is built alike,
-  walls and lines agree, and points do not. A jump is proven by the map alone, and the place where a camera was found again by three frames in a row.
+  walls and lines agree, and points do not. A jump is verified by the map alone, and the place where a camera is found again by three frames in a row.
   It keeps finding what was mapped before it was lost; in a room like the one it was taken to be in, it does until it leaves.
 - **Freshness**: an image that repeats the one before, wholly or for the most part, measures nothing.
 
@@ -27,7 +27,7 @@ from trihedron.pipeline.core.geometry import invert, transform
 from trihedron.pipeline.core.lie import log_so3
 from trihedron.pipeline.core.linalg import matmul, norm, solve
 from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat, Share
-from trihedron.pipeline.core.types import DEGRADED, F64, I32, LOST, OK, Keypoints, Planes, Pose, Rotation, Tracks, Translation
+from trihedron.pipeline.core.types import DEGRADED, F32, F64, I32, LOST, OK, Keypoints, Planes, Pose, Rotation, Tracks, Translation
 from trihedron.plugins.mapping.submaps import is_elsewhere
 from trihedron.plugins.pose.calibration_uncertainty import contradicted_calibration
 from trihedron.plugins.pose.dynamic_objects import MovingOptions, Selection, status_with_static
@@ -124,15 +124,15 @@ def status_by_images(status: TrackingStatus, evidence: Evidence, repeats: int) -
     return status
 
 
-def judge_by_run(pose: Pose, previous: Pose) -> Pose:
+def judge_by_run(pose: Pose) -> Pose:
     """Degrade an ok pose that contradicts the run so far: its matched points have disagreed for ten frames, planes turned otherwise, what was mapped
     before the latest loss is not there, or the residuals contradict the calibration; and one that too few frames since that loss have confirmed."""
     tests = contradiction_so_far, _found_elsewhere, contradicted_calibration
     reason = next(filter(None, (test(pose) for test in tests)), "") if pose.status == OK else ""
     pose = replace(pose, status=DEGRADED, reason=reason) if reason else pose
-    if not pose.lost_from or previous.confirmations == CONFIRMING:
-        return replace(pose, confirmations=previous.confirmations)
-    pose = replace(pose, confirmations=previous.confirmations + 1 if pose.status == OK else 0)
+    if not pose.lost_from or pose.confirmations == CONFIRMING:
+        return pose
+    pose = replace(pose, confirmations=pose.confirmations + 1 if pose.status == OK else 0)
     if pose.status != OK or pose.confirmations == CONFIRMING:
         return pose
     reason = f"found again, which {pose.confirmations} of {CONFIRMING} frames in a row confirm: {pose.reason}"
@@ -195,9 +195,13 @@ def repeated_images(previous: Pose, tracks: Tracks | None, keypoints: Keypoints,
         return 0
     before, points, walls = tracks.points_m, keypoints.points_m[tracks.keypoints[:, 1]], planes.coefficients[tracks.planes[:, 1]]
     whole = len(points) + len(walls) and np.array_equal(before, points, True) and np.array_equal(tracks.coefficients, walls, True)
-    with_depth = np.count_nonzero(np.isfinite(before[:, 2]) & np.isfinite(points[:, 2]))
-    partly = (tracks.coefficients == walls).all(axis=1).any() and 2 * np.count_nonzero((before == points).all(axis=1)) > with_depth
-    return previous.repeats + 1 if whole or partly else 0
+    return previous.repeats + 1 if whole or ((tracks.coefficients == walls).all(axis=1).any() and _most_alike(before, points)) else 0
+
+
+def _most_alike(before: F32, now: F32) -> bool:
+    """Return whether more than half of the key points (n, 3) that have depth in both images are bit-identical."""
+    with_depth = np.isfinite(before[:, 2]) & np.isfinite(now[:, 2])
+    return bool(2 * np.count_nonzero((before == now).all(axis=1)) > np.count_nonzero(with_depth))
 
 
 def _repeating(repeats: int) -> str:

@@ -113,7 +113,7 @@ class Refine(JudgementOptions):
         pose = in_world(replace(pose, repeats=repeats, keyframe_covariance=shared), previous, solution, problem)
         pose = with_disagreement(with_turn_difference(pose, previous, tracks, planes), previous, inliers, static)
         missing = missing_points(previous, submap, problem, T)
-        return judge_by_run(replace(pose, lost_from=previous.lost_from, missing=missing), previous)
+        return judge_by_run(replace(since_loss(pose, previous), missing=missing))
 
     def localising(self) -> Refine:
         """Return the refinement of a camera that begins no sub-map: where the loaded map does not reach it stays lost."""
