@@ -236,7 +236,10 @@ class Tracks(Value):
     """Features of this frame found in the previous one. Pairs are rows (previous, current).
 
     The previous geometry is copied, in the previous camera frame, so that motion can be solved from Tracks and the current features alone.
-    `R_current_previous` is the rotation that predicted the search, corrected by the pairs found."""
+    `R_current_previous` is the rotation that predicted the search, corrected by the pairs found. `repeated` is the share of the pairs of key points
+    whose pixel and descriptor are bit-identical in both: at most 0.02 of two images, and most of them where colour repeats, wholly or in part."""
+
+    version: ClassVar[int] = 2
 
     previous_index: int
     keypoints: Annotated[I32, Shape("n", 2), IndexInto("previous_keypoints", "keypoints")]
@@ -248,6 +251,7 @@ class Tracks(Value):
     coefficients: Annotated[F64, Shape("p", 4), UnitNormals()]  # previous
     plane_covariance: Annotated[F64, Shape("p", 3, 3)]
     R_current_previous: Annotated[F64, Shape(3, 3), Rotations()]
+    repeated: Annotated[float, Within(0.0, 1.0)] = 0.0
 
 
 @dataclass(frozen=True)
@@ -319,13 +323,14 @@ class Pose(Value):
     keyframes which created these landmarks where it is much more than the pose's own, else zero: landmarks made from this pose count it in their
     weights.
 
-    `repeats` is the number of images in a row, up to this one, of which all or most repeats the one before bit for bit; `disagreement` the share of
-    the matched points that do not agree with their frame's pose, as a moving average over ten frames. `lost_from` is the number of the first frame of
-    the latest loss, 0 for none, and `missing` the share of the points mapped before it that should have been matched since the camera was found again
-    and were not, as a moving average over a thousand of them; `confirmations` the number of frames in a row since, at most three, that would be ok
-    but for the loss. `turn_difference` is the rotation (rad, camera frame) by which planes turned more than the pose, as a moving average over ten
-    frames, and `usual_turn_difference` its usual size in one frame, 0.3° before the first. `plane_counts` counts matched planes, those that disagree
-    with their frame's pose and all: of the latest 60 or so and of the latest 600 (rows), with weights that decrease with age.
+    `repeats` is the number of images in a row, up to this one, of which all or most repeats the one before bit for bit, in colour and depth, or in
+    colour while planes disagree; `disagreement` the share of the matched points that do not agree with their frame's pose, as a moving average over
+    ten frames. `lost_from` is the number of the first frame of the latest loss, 0 for none, and `missing` the share of the points mapped before it
+    that should have been matched since the camera was found again and were not, as a moving average over a thousand of them; `confirmations` the
+    number of frames in a row since, at most three, that would be ok but for the loss. `turn_difference` is the rotation (rad, camera frame) by which
+    planes turned more than the pose, as a moving average over ten frames, and `usual_turn_difference` its usual size in one frame, 0.3° before the
+    first. `plane_counts` counts matched planes, those that disagree with their frame's pose and all: of the latest 60 or so and of the latest 600
+    (rows), with weights that decrease with age.
 
     Five fields are what the pose's error owes to an imperfect calibration (`plugins.shared.calibration_error`, which defines the parameters and their
     units): `sensitivity` is the derivative of the error by them, `calibration_information` and `calibration_score` the information of the residuals

@@ -94,7 +94,7 @@ class Refine(JudgementOptions):
         problem = MapAlignment(self, start.T_world_camera, self._information(start), camera, matches, keypoints, segments, planes, map)
         solution, static = self._solve(problem, start)
         inliers = problem.statistics(solution)
-        evidence = Evidence(problem, solution, static, inliers, rotation, translation, submap, previous)
+        evidence = Evidence(problem, solution, static, inliers, rotation, translation, tracks, submap, previous)
         if start.status == LOST and not is_found_again(self, evidence):
             searched = relocalise is not None and translation.estimated
             return self._stay_lost(start, rotation, previous, searched, map, submap)
@@ -103,7 +103,8 @@ class Refine(JudgementOptions):
         if not inliers.total:
             reason = "nothing of the map was found, pose from the previous frame"
             return self._unrefined(start.to_pose(rotation, map, reason, submap), previous)
-        repeats, status = repeated_images(previous, tracks, keypoints, planes), status_by_matches(self, evidence)
+        repeats = repeated_images(previous, tracks, keypoints, planes, inliers)
+        status = status_by_matches(self, evidence)
         shared = keyframe_covariance(solution, problem, self.weak_foundation) if status.status == OK else np.zeros((6, 6))
         status = status_by_images(status, evidence, repeats)
         T, held, counts = solution.T_world_camera, solution.unobservable.shape[1], np.array(inliers.inliers, np.int32)

@@ -66,7 +66,17 @@ def tracks_value(now: Features, before: Features, pairs: tuple[I32, I32, I32], R
         coefficients=before.planes.coefficients[planes[:, 0]],
         plane_covariance=before.planes.covariance[planes[:, 0]],
         R_current_previous=R_current_previous,
+        repeated=_repeated(now.keypoints, before.keypoints, points),
     )
+
+
+def _repeated(now: Keypoints, before: Keypoints, pairs: I32) -> float:
+    """Share of the pairs (n, 2) of key points, rows (previous, current), whose pixel and descriptor are bit-identical."""
+    same = pairs[(before.pixels[pairs[:, 0]] == now.pixels[pairs[:, 1]]).all(axis=1)]
+    if not len(same):
+        return 0.0
+    alike = before.descriptors[same[:, 0]] == now.descriptors[same[:, 1]]
+    return float(np.count_nonzero(alike.all(axis=1)) / len(pairs))
 
 
 def predict_pixels(pixels: F32, points_m: F32, camera: Camera, R: F64, t: F64) -> F64:

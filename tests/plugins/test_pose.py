@@ -411,7 +411,25 @@ def test_an_image_may_repeat_in_part(points, walls, repeated):
         coefficients=coefficients,
         plane_covariance=np.zeros((3, 3, 3)),
     )
-    assert repeated_images(previous, tracks, keypoints, planes) == repeated
+    assert repeated_images(previous, tracks, keypoints, planes, InlierStatistics((40, 0, 3), (40, 0, 3))) == repeated
+
+
+@pytest.mark.parametrize("share, moved_m, repeats", [(0.9, 0.1, 1), (0.9, 0.0, 0), (0.5, 0.1, 0)])
+def test_color_that_repeats_while_depth_does_not(share, moved_m, repeats):
+    """Where most key points are bit-identical, planes that moved show that colour is frozen; those of a camera at rest agree, and its video may repeat."""
+    world, map = World(), first_map(World())
+    features = keypoints, segments, planes = world.features(camera_at(5), 5)
+    camera, rotation, translation = world.frame(5).camera, rotation_of(camera_at(5), 5, 0.5), translation_of(camera_at(5), 5, sigma_m=0.03)
+    matches = LocalMap()(camera, rotation, translation, *features, map, None)
+    tracks = dataclasses.replace(tracks_of(world, 4, 5)[0], repeated=share)
+    moved = dataclasses.replace(planes, coefficients=planes.coefficients + [0.0, 0.0, 0.0, moved_m])
+    pose = Refine()(camera, rotation, translation, tracks, matches, keypoints, segments, moved, pose_of(camera_at(4), 4), map, None)
+    assert (pose.repeats, pose.status) == (repeats, "degraded" if repeats else "ok")
+    if repeats:
+        n = len(planes.coefficients)
+        assert pose.reason == (
+            f"colour repeats the previous frame, and depth does not: 90 % of the key points are bit-identical, {n} of {n} planes disagree"
+        )
 
 
 def test_a_repeated_image_is_no_measurement():

@@ -192,6 +192,20 @@ def test_motion_without_terms_is_the_prediction_with_the_prior(room):
     assert np.allclose(np.sqrt(np.diag(motion.covariance)), np.repeat([np.radians(2.0), 0.1], 3))
 
 
+def test_the_share_of_key_points_that_repeat(room):
+    """A frame against itself, of which so many key points have another pixel or descriptor; two frames of a camera that moves."""
+    world, rng = room(), np.random.default_rng(9)
+    before, next_one = world.see(START, 0, rng), world.see(pose([0.2, 0.5, 0.1], [0.01, 0.0, 0.0]), 1, rng)
+    keypoints, *others = before
+    pixels, descriptors = keypoints.pixels.copy(), keypoints.descriptors.copy()
+    pixels[::4, 0] += 0.01
+    descriptors[1::4, 0] ^= 1
+    half = replace(keypoints, index=1, pixels=pixels, descriptors=descriptors)
+    assert track(world, (half, *others), before).repeated == pytest.approx(0.5, abs=0.02)
+    assert track(world, (replace(keypoints, index=1), *others), before).repeated == 1.0
+    assert track(world, next_one, before).repeated == 0.0
+
+
 def test_same_bytes_again(room):
     world, rng = room(0, points=1000, edges=100), np.random.default_rng(8)
     before, now = world.see(START, 0, rng), world.see(pose([0.2, 0.5, 0.1], [0.01, 0.0, 0.0]), 1, rng)
