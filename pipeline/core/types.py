@@ -327,10 +327,10 @@ class Pose(Value):
     colour while planes disagree; `disagreement` the share of the matched points that do not agree with their frame's pose, as a moving average over
     ten frames. `lost_from` is the number of the first frame of the latest loss, 0 for none, and `missing` the share of the points mapped before it
     that should have been matched since the camera was found again and were not, as a moving average over a thousand of them; `confirmations` the
-    number of frames in a row since, at most three, that would be ok but for the loss. `turn_difference` is the rotation (rad, camera frame) by which
-    planes turned more than the pose, as a moving average over ten frames, and `usual_turn_difference` its usual size in one frame, 0.3° before the
-    first. `plane_counts` counts matched planes, those that disagree with their frame's pose and all: of the latest 60 or so and of the latest 600
-    (rows), with weights that decrease with age.
+    number of frames in a row since, at most three, that would be ok but for the loss, and with which planes agree. `turn_difference` is the rotation
+    (rad, camera frame) by which planes turned more than the pose, as a moving average over ten frames, and `usual_turn_difference` its usual size in
+    one frame, 0.3° before the first. `plane_counts` counts matched planes, those that disagree with their frame's pose and all: of the latest 60 or
+    so and of the latest 600 (rows), with weights that decrease with age.
 
     Five fields are what the pose's error owes to an imperfect calibration (`plugins.shared.calibration_error`, which defines the parameters and their
     units): `sensitivity` is the derivative of the error by them, `calibration_information` and `calibration_score` the information of the residuals

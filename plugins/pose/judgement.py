@@ -9,7 +9,8 @@ status, with its figures:
   points and planes disagreed than usual, planes turn as the camera does (`contradiction.py`), and the residuals so far do not contradict the
   camera's calibration (`calibration_uncertainty.py`). A frame that comes after a contradiction, and that the map does not support, is lost.
 - **Continuity**: the rotation was measured, and the frame continues the previous one, or the map knows its details: of a place that is built alike,
-  walls and lines agree, and points do not. A jump is verified by the map alone, and the place where a camera is found again by three frames in a row.
+  walls and lines agree, and points do not. A jump is verified by the map alone, and the place where a camera is found again by three frames in a row
+  with which their planes agree.
   It keeps finding what was mapped before it was lost; in a room like the one it was taken to be in, it does until it leaves.
 - **Freshness**: an image that repeats the one before, wholly or for the most part, measures nothing, nor does one whose colour repeats it and whose
   depth does not.
@@ -43,7 +44,7 @@ MISSING_POINTS = 1000.0  # mapped before the camera was lost, that their missing
 SAME_M, SAME_SHARE = 0.05, 0.03  # and share of its depth, from the plane that is observed there, within which a point lies on it
 SAME_VIEW, SAME_DISTANCE = np.cos(np.deg2rad(30.0)), 1.5  # between views of a point, and ratio of their distances, that show the same of it
 JUMP_SIGMAS2 = 16.3  # Mahalanobis distance² (0.999 quantile of χ² with 3 dof) from a predicted rotation beyond which the camera has jumped
-CONFIRMING = 3  # frames in a row, each ok by itself, from the third of which on a camera that was found again is ok
+CONFIRMING = 3  # frames in a row, ok by themselves and their planes, from the third of which on a camera that was found again is ok
 MOST_REPEATED = 0.5  # of the tracked key points: at most 0.02 of two images of six sequences, 0.7 and more where two fifths of colour are frozen
 BLURRED_PX = 1.0  # blur that is worth a word: with more the covariance is half as large again
 
@@ -127,15 +128,16 @@ def status_by_images(status: TrackingStatus, evidence: Evidence, repeats: int) -
     return status
 
 
-def judge_by_run(pose: Pose) -> Pose:
+def judge_by_run(pose: Pose, planes_agree: bool) -> Pose:
     """Degrade an ok pose that contradicts the run so far: its matched points have disagreed for ten frames, planes turned otherwise, what was mapped
-    before the latest loss is not there, or the residuals contradict the calibration; and one that too few frames since that loss have confirmed."""
+    before the latest loss is not there, or the residuals contradict the calibration; and one that too few frames since that loss have confirmed:
+    frames in a row that are ok, and with which most of their planes agree (`planes_agree`)."""
     tests = contradiction_so_far, _found_elsewhere, contradicted_calibration
     reason = next(filter(None, (test(pose) for test in tests)), "") if pose.status == OK else ""
     pose = replace(pose, status=DEGRADED, reason=reason) if reason else pose
     if not pose.lost_from or pose.confirmations == CONFIRMING:
         return pose
-    pose = replace(pose, confirmations=pose.confirmations + 1 if pose.status == OK else 0)
+    pose = replace(pose, confirmations=pose.confirmations + 1 if pose.status == OK and planes_agree else 0)
     if pose.status != OK or pose.confirmations == CONFIRMING:
         return pose
     reason = f"found again, which {pose.confirmations} of {CONFIRMING} frames in a row confirm: {pose.reason}"

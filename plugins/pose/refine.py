@@ -114,7 +114,7 @@ class Refine(JudgementOptions):
         pose = in_world(replace(pose, repeats=repeats, keyframe_covariance=shared), previous, solution, problem)
         pose = with_disagreement(with_turn_difference(pose, previous, tracks, planes), previous, inliers, static)
         missing = missing_points(previous, submap, problem, T)
-        return judge_by_run(replace(since_loss(pose, previous), missing=missing))
+        return judge_by_run(replace(since_loss(pose, previous), missing=missing), not inliers.most_planes_disagree)
 
     def localising(self) -> Refine:
         """Return the refinement of a camera that begins no sub-map: where the loaded map does not reach it stays lost."""

@@ -28,7 +28,7 @@ def test_planes_that_disagree_more_than_usual_are_a_contradiction():
     assert not any(map(contradiction_so_far, clean))
     assert not any(map(contradiction_so_far, frozen[:3])) and all(map(contradiction_so_far, frozen[8:]))
     assert not any(map(contradiction_so_far, after[2:]))
-    judged = judge_by_run(frozen[8])
+    judged = judge_by_run(frozen[8], planes_agree=False)
     assert judged.status == "degraded"
     assert judged.reason == "colour and depth contradict each other: of late 70 % of the planes disagree with the points, usually 30 %"
 
