@@ -25,7 +25,8 @@ def planar_components(
     (rad) in each further round. The normals of a plane lie within the cone and turn by no more than `turn` cones."""
     coarse = coarser(grid, edge[0], edge[1])
     h, w = coarse.rho.shape
-    labels, planes, found, before = np.zeros((h, w), np.uint8), np.zeros((most, 3)), 0, -1
+    labels, planes = np.zeros((h, w), np.uint8), np.zeros((most, 3))
+    found, before = np.int64(0), np.int64(-1)  # as literals, numba would compile `fit_components` for them, too
     links, free = smooth_links(coarse, np.cos(angle), gate), np.empty((h, w), np.bool_)
     cells, starts = np.empty(0, np.int32), np.zeros(1, np.int32)
     for _ in range(rounds):

@@ -265,12 +265,13 @@ def add_scores(
     weights = Weights(np.empty((n, 3, 3)), np.empty((m, 2, 2)), np.empty((m, 2, 2)), np.empty((p, 3, 3)))
     chi2 = Chi2(np.empty(n), np.empty(m), np.empty(m), np.empty(p))
     fill_weights(R, t, camera, points, lines, planes, weights)
+    robust, free = np.bool_(False), np.int64(6)  # as literals, numba would compile what takes them anew
     for i in range(n):
         a, b, k = i, i + 1, groups.points[i]
         one = PointTerms(
             points.positions_m[a:b], points.covariance_m2[a:b], points.pixels[a:b], points.depth_m[a:b], points.sigma_px[a:b], points.sigma_m[a:b]
         )
-        _add_points(R, t, camera, one, weights.points[a:b], flags.points[a:b], False, 6, H[k], g[k], chi2.points[a:b])
+        _add_points(R, t, camera, one, weights.points[a:b], flags.points[a:b], robust, free, H[k], g[k], chi2.points[a:b])
     for i in range(m):
         a, b, k = i, i + 1, groups.lines[i]
         line = LineTerms(
@@ -278,7 +279,7 @@ def add_scores(
             lines.observed_covariance_m2[a:b],
         )  # fmt: skip
         W, V = weights.lines[a:b], weights.line_depths[a:b]
-        _add_lines(R, t, camera, line, W, V, flags.lines[a:b], False, H[k], g[k], chi2.lines[a:b], chi2.line_depths[a:b])
+        _add_lines(R, t, camera, line, W, V, flags.lines[a:b], robust, H[k], g[k], chi2.lines[a:b], chi2.line_depths[a:b])
     for i in range(p):
         a, b, k = i, i + 1, groups.planes[i]
         plane = PlaneTerms(planes.kinds[a:b], planes.coefficients[a:b], planes.covariance[a:b], planes.observed[a:b], planes.observed_covariance[a:b])
