@@ -100,10 +100,11 @@ $(VENV)/installed: $(VENV)/created pyproject.toml $(LOCK)
 	$(PIP) --upgrade --upgrade-strategy eager --no-build-isolation -e ".[dev]"
 	@touch $(VENV)/base $@
 
+# Without the bytecode of all that is never imported: the first run makes that of the rest.
 $(VENV)/base: $(VENV)/created pyproject.toml $(LOCK)
 	@echo "Installing into $(VENV) (about 700 MB to download the first time)"
 	$(PIP) --quiet --upgrade pip setuptools
-	$(PIP) --upgrade --upgrade-strategy eager --no-build-isolation -e .
+	$(PIP) --upgrade --upgrade-strategy eager --no-build-isolation --no-compile -e .
 	@touch $@
 
 # 3: a library that only some stages use is missing; said each time, until it is there.
