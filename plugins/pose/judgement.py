@@ -123,7 +123,7 @@ def status_by_images(status: TrackingStatus, evidence: Evidence, repeats: int) -
     if evidence.submap:
         reason = f"in sub-map {evidence.submap}, which is not merged with the first yet: {status.reason}"
         status = replace(status, status=DEGRADED, reason=reason)
-    if status.status == OK and (reason := _repeating_in_color(evidence.tracks, evidence.inliers) or _repeating(repeats)):
+    if status.status == OK and (reason := _repeating_in_color(evidence.tracks, problem.planes, evidence.inliers) or _repeating(repeats)):
         return replace(status, status=DEGRADED, reason=reason)
     return status
 
@@ -200,8 +200,8 @@ def repeated_images(previous: Pose, tracks: Tracks | None, keypoints: Keypoints,
         return 0
     before, points, walls = tracks.points_m, keypoints.points_m[tracks.keypoints[:, 1]], planes.coefficients[tracks.planes[:, 1]]
     whole = len(points) + len(walls) and np.array_equal(before, points, True) and np.array_equal(tracks.coefficients, walls, True)
-    partly = (tracks.coefficients == walls).all(axis=1).any() and _most_alike(before, points)
-    return previous.repeats + 1 if whole or partly or _repeating_in_color(tracks, inliers) else 0
+    partly = _has_same_plane(tracks, planes) and _most_alike(before, points)
+    return previous.repeats + 1 if whole or partly or _repeating_in_color(tracks, planes, inliers) else 0
 
 
 def _most_alike(before: F32, now: F32) -> bool:
@@ -210,16 +210,18 @@ def _most_alike(before: F32, now: F32) -> bool:
     return bool(2 * np.count_nonzero((before == now).all(axis=1)) > np.count_nonzero(with_depth))
 
 
-def _repeating_in_color(tracks: Tracks | None, inliers: InlierStatistics) -> str:
-    """Return why an image whose colour repeats the one before contradicts its depth: most planes, which depth alone measures, disagree with the pose.
-    Of a camera at rest they agree, and the colour of a compressed video may repeat."""
-    if tracks is None or tracks.repeated <= MOST_REPEATED or not inliers.most_planes_disagree:
+def _has_same_plane(tracks: Tracks, planes: Planes) -> bool:
+    """Return whether a plane is bit-identical to that of the previous image."""
+    return bool((tracks.coefficients == planes.coefficients[tracks.planes[:, 1]]).all(axis=1).any())
+
+
+def _repeating_in_color(tracks: Tracks | None, planes: Planes, inliers: InlierStatistics) -> str:
+    """Return why an image whose colour repeats the one before, and whose depth does not, contradicts itself: most planes, which depth alone measures,
+    disagree with the pose. Of a camera at rest they agree, and the colour of a compressed video may repeat."""
+    if tracks is None or tracks.repeated <= MOST_REPEATED or not inliers.most_planes_disagree or _has_same_plane(tracks, planes):
         return ""
-    repeated, planes = (
-        f"{100.0 * tracks.repeated:.0f} % of the key points",
-        f"{inliers.matched[2] - inliers.inliers[2]} of {inliers.matched[2]} planes",
-    )
-    return f"colour repeats the previous frame, and depth does not: {repeated} are bit-identical, {planes} disagree"
+    disagree = f"{inliers.matched[2] - inliers.inliers[2]} of {inliers.matched[2]} planes disagree"
+    return f"colour repeats the previous frame, and depth does not: {100.0 * tracks.repeated:.0f} % of the key points are bit-identical, {disagree}"
 
 
 def _repeating(repeats: int) -> str:
