@@ -259,14 +259,15 @@ def test_a_recording_of_format_3_is_upgraded(tmp_path, capsys):
 
 
 def test_a_recording_of_format_4_is_read_and_upgraded(tmp_path, capsys):
-    """What the previous version wrote, with one schema for all values, times as JSON, is the same after conversion; each type has its schema. Poses
-    and keyframes have fields since, with what nothing is known of."""
+    """What the previous version wrote, with one schema for all values, times as JSON, is the same after conversion; each type has its schema.
+    Poses, tracks and keyframes have fields since, with what nothing is known of."""
     old, new = Path(__file__).parent / "recordings" / "format_4.mcap", tmp_path / "new.mcap"
     assert main(["convert", str(old), str(new)]) == 0
-    assert main(["diff", str(old), str(new), "--topics", ",".join(sorted(Recording(old).topics - {"frames", "map", "pose"}))]) == 0
+    assert main(["diff", str(old), str(new), "--topics", ",".join(sorted(Recording(old).topics - {"frames", "map", "pose", "tracks"}))]) == 0
     assert "equal: 3 frames" in capsys.readouterr().out
     assert not any(pose.sensitivity.any() or pose.calibration_information.any() for pose in Recording(new).values("pose"))
     assert not any(map.keyframes.column("sensitivity").any() for map in Recording(new).values("map"))
+    assert [tracks.repeated for tracks in Recording(new).values("tracks")] == [0.0, 0.0]
     before, after = Recording(old), Recording(new)
     assert after.metadata["format"] == FORMAT and after.topics == before.topics
     images = {"/dataset/color": 3, "/dataset/depth": 3}
