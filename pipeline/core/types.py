@@ -237,7 +237,7 @@ class Tracks(Value):
 
     The previous geometry is copied, in the previous camera frame, so that motion can be solved from Tracks and the current features alone.
     `R_current_previous` is the rotation that predicted the search, corrected by the pairs found. `repeated` is the share of the pairs of key points
-    whose pixel and descriptor are bit-identical in both: at most 0.02 of two images, and most of them where colour repeats, wholly or in part."""
+    whose pixel and descriptor are bit-identical in both images: hardly any, but most of them where colour repeats, wholly or in part."""
 
     version: ClassVar[int] = 2
 
