@@ -1,7 +1,8 @@
-"""Contradictions between colour, depth and the map that last for several frames: such a pose is not ok, and is not mapped.
+"""Contradictions between colour, depth and the map. A frame of whose matches most disagree is not mapped, and the map goes on to contradict those
+that follow; a pose of a contradiction that lasts for several frames is not ok, and not mapped either.
 
-Each is a share or a rotation averaged over the latest frames: matched points that disagree with their pose; matched planes that do, beyond what is
-usual in this run (with an imperfect calibration most of them may); and planes that turn otherwise than the camera (`plane_turns.py`)."""
+Each of the latter is a share or a rotation averaged over the latest frames: matched points that disagree with their pose; matched planes that do,
+beyond what is usual in this run (with an imperfect calibration most may); and planes that turn otherwise than the camera (`plane_turns.py`)."""
 
 from __future__ import annotations
 
@@ -9,11 +10,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from trihedron.pipeline.core.types import F64, Pose
+from trihedron.pipeline.core.types import DEGRADED, F64, Matches, Pose
 from trihedron.plugins.shared.plane_turns import contradicting_turn
 
 AVERAGED_FRAMES = 10  # that the disagreement of points is averaged over
 MOST_DISAGREEMENT = 0.5  # of points: more is no moment of blur and nobody who walks by; at most 0.35 of five cameras as they are stated
+LEAST_AGREEING = 0.25  # of the matches of a frame that is mapped: landmarks made from another one would agree with the next frame, right or wrong
 AVERAGED_PLANES = np.array([[60.0], [600.0]])  # that their disagreement of late, and the usual one, are averaged over
 LEAST_PLANES = 8  # of a frame that are counted: of fewer, two that are matched wrongly from frame to frame are most
 UNUSUAL = 0.2  # that a plane counts in what is usual while they disagree
@@ -23,6 +25,13 @@ MOST_DISAGREEING_PLANES = 0.4  # beyond the usual share; at most 0.34 of 75 simu
 def contradiction_so_far(pose: Pose) -> str:
     """Return why the images up to a pose contradict each other or the map, empty where they do not."""
     return _disagreeing_points(pose) or contradicting_depth(pose)
+
+
+def contradicts_map(pose: Pose, matches: Matches) -> bool:
+    """Return True where three quarters of a frame's matches with the map disagree with its pose; not where none agrees, as of a pose without the
+    map."""
+    count, agreeing = len(matches.keypoints) + len(matches.segments) + len(matches.planes), int(pose.inliers.sum())
+    return pose.status == DEGRADED and 0 < agreeing < LEAST_AGREEING * count
 
 
 def contradicting_depth(pose: Pose) -> str:

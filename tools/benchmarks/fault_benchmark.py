@@ -35,6 +35,7 @@ CASES = {  # name -> what the data set is given
     "every_tenth": ("dataset.every=10", "+dataset.options.length=600"),
     "every_tenth_fast": ("dataset.every=10", "+dataset.options.length=600", "+dataset.options.motion=fast"),
     "wrong_scale_for_a_second": ("dataset.depth_times=1.2", "dataset.during=30:60"),
+    "slightly_wrong_scale": ("dataset.depth_times=1.07", "dataset.during=30:"),
     "wrong_focal_length": ("dataset.focal_times=1.2",),
     "mirrored_color": ("dataset.mirror=true",),
     "mirrored_for_a_second": ("dataset.mirror=true", "dataset.during=30:60"),
