@@ -325,19 +325,21 @@ class Pose(Value):
 
     `repeats` is the number of images in a row, up to this one, of which all or most repeats the one before bit for bit, in colour and depth, or in
     colour while planes disagree; `disagreement` the share of the matched points that do not agree with their frame's pose, as a moving average over
-    ten frames. `lost_from` is the number of the first frame of the latest loss, 0 for none, and `missing` the share of the points mapped before it
-    that should have been matched since the camera was found again and were not, as a moving average over a thousand of them; `confirmations` the
-    number of frames in a row since, at most three, that would be ok but for the loss, and with which planes agree. `turn_difference` is the rotation
-    (rad, camera frame) by which planes turned more than the pose, as a moving average over ten frames, and `usual_turn_difference` its usual size in
-    one frame, 0.3° before the first. `plane_counts` counts matched planes, those that disagree with their frame's pose and all: of the latest 60 or
-    so and of the latest 600 (rows), with weights that decrease with age.
+    ten frames. `jumps` is the number of frames in a row, up to this one, to which the camera moved as nothing does that is carried. `lost_from` is
+    the number of the first frame of the latest loss, or of a later jump, 0 for none, and `missing` the share of the points mapped before it that
+    should have been matched since the camera was found again and were not, as a moving average over a thousand of them; `confirmations` the number of
+    frames in a row since, at most three, that would be ok but for the loss, and with which planes agree. `turn_difference` is the rotation (rad,
+    camera frame) by which planes turned more than the pose, as a moving average over ten frames, and `usual_turn_difference` its usual size in one
+    frame, 0.3° before the first. `plane_counts` counts matched planes, those that disagree with their frame's pose and all: of the latest 60 or so
+    and of the latest 600 (rows), with weights that decrease with age. `usual_accelerations` are the number of frames, at most ten, whose linear
+    (m/s²) and angular (rad/s²) acceleration is known, and the largest of these, less 1 % for each frame since.
 
     Five fields are what the pose's error owes to an imperfect calibration (`plugins.shared.calibration_error`, which defines the parameters and their
     units): `sensitivity` is the derivative of the error by them, `calibration_information` and `calibration_score` the information of the residuals
     on them so far. `twist` is the camera's velocity (m/s, rad/s) in its own frame, `reference_twist` that of the reference keyframe.
     `depth_scale_sigma` is the relative standard deviation of the scale of all depths, of which residuals tell nothing."""
 
-    version: ClassVar[int] = 8
+    version: ClassVar[int] = 9
 
     T_world_camera: Annotated[F64, Shape(4, 4), Rotations()]
     covariance: Annotated[F64, Shape(6, 6), Finite()]
@@ -368,6 +370,8 @@ class Pose(Value):
     usual_turn_difference: Annotated[float, Within(0.0, np.pi)] = USUAL_TURN_DIFFERENCE
     plane_counts: Annotated[F64, Shape(2, 2), Finite()] = field(default_factory=lambda: np.zeros((2, 2)))
     confirmations: Annotated[int, Within(0, 2**31)] = 0
+    jumps: int = 0
+    usual_accelerations: Annotated[F64, Shape(3), Finite()] = field(default_factory=lambda: np.zeros(3))
 
     @property
     def local_covariance(self) -> F64:

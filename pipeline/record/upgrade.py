@@ -48,6 +48,7 @@ ADDED_FIELDS: dict[tuple[str, int], dict[str, Any]] = {  # type and older versio
     ("Pose", 5): {"turn_difference": np.zeros(3), "usual_turn_difference": USUAL_TURN_DIFFERENCE},
     ("Pose", 6): {"plane_counts": np.zeros((2, 2))},
     ("Pose", 7): {"confirmations": 0},
+    ("Pose", 8): {"jumps": 0, "usual_accelerations": np.zeros(3)},
     ("Tracks", 1): {"repeated": 0.0},
     ("Map", 5): {"loop_closed": 0},
     ("Building", 1): {"doubts": np.zeros((0, 3))},

@@ -13,11 +13,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from trihedron.pipeline.core.geometry import invert
 from trihedron.pipeline.core.kernel import constant
-from trihedron.pipeline.core.lie import log_se3
-from trihedron.pipeline.core.linalg import matmul
-from trihedron.pipeline.core.types import F64, I32, LOST, Map, Pose
+from trihedron.pipeline.core.types import F64, I32, Map, Pose
 from trihedron.plugins.pose.map_alignment import MapAlignment
 from trihedron.plugins.shared.calibration_error import CALIBRATION_NAMES, calibration_scales
 from trihedron.plugins.shared.calibration_error_kernels import (
@@ -33,25 +30,17 @@ from trihedron.plugins.shared.pose_optimizer_kernels import Flags
 
 REPEATED_FRAMES = 20  # in which the errors of a landmark's residuals repeat: so many frames tell of the calibration as much as one
 CALIBRATION_SIGMAS = 2.0  # root mean square of the parameters beyond which the calibration is not that of the camera
-LONGEST_S = 1.0  # between two frames that a velocity is taken from
 
 
-def with_velocity(pose: Pose, previous: Pose, map: Map) -> Pose:
-    """Give a pose the velocity of the camera, and that of its reference keyframe: the mean of the motions to it and from it. An image that repeats
-    the one before has that one's."""
-    seconds = 1e-9 * (pose.stamp_ns - previous.stamp_ns)
-    known = previous.status != LOST and 0.0 < seconds <= LONGEST_S
-    if pose.repeats:
-        twist = previous.twist
-    else:
-        twist = log_se3(matmul(invert(previous.T_world_camera), pose.T_world_camera)) / seconds if known else np.zeros(6)
+def with_reference_velocity(pose: Pose, previous: Pose, map: Map) -> Pose:
+    """Give a pose the velocity of its reference keyframe: the mean of the motions to it and from it."""
     if not 0 <= pose.reference < len(map.keyframes):
-        return replace(pose, twist=twist)
+        return pose
     if int(map.keyframes.row("index", pose.reference)) == previous.index:
-        reference_twist = 0.5 * (previous.twist + twist) if known and previous.twist.any() else twist
-    else:
-        reference_twist = previous.reference_twist if previous.reference == pose.reference else map.keyframes.row("twist", pose.reference)
-    return replace(pose, twist=twist, reference_twist=reference_twist)
+        known = pose.twist.any() and previous.twist.any()
+        return replace(pose, reference_twist=0.5 * (previous.twist + pose.twist) if known else pose.twist)
+    kept = previous.reference_twist if previous.reference == pose.reference else map.keyframes.row("twist", pose.reference)
+    return replace(pose, reference_twist=kept)
 
 
 def with_calibration(pose: Pose, previous: Pose, problem: MapAlignment, flags: Flags, keyframes: Keyframes, observed: Observers) -> Pose:

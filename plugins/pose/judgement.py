@@ -9,8 +9,8 @@ status, with its figures:
   points and planes disagreed than usual, planes turn as the camera does (`contradiction.py`), and the residuals so far do not contradict the
   camera's calibration (`calibration_uncertainty.py`). A frame that comes after a contradiction, and that the map does not support, is lost.
 - **Continuity**: the rotation was measured, and the frame continues the previous one, or the map knows its details: of a place that is built alike,
-  walls and lines agree, and points do not. A jump is verified by the map alone, and the place where a camera is found again by three frames in a row
-  with which their planes agree.
+  walls and lines agree, and points do not. A jump from a predicted rotation is verified by the map alone. The place where a camera is found again, or
+  where it is after a change of motion that nothing carried makes (`continuity.py`), three frames in a row verify with which their planes agree.
   It keeps finding what was mapped before it was lost; in a room like the one it was taken to be in, it does until it leaves.
 - **Freshness**: an image that repeats the one before, wholly or for the most part, measures nothing, nor does one whose colour repeats it and whose
   depth does not.
@@ -128,12 +128,13 @@ def status_by_images(status: TrackingStatus, evidence: Evidence, repeats: int) -
     return status
 
 
-def judge_by_run(pose: Pose, planes_agree: bool) -> Pose:
-    """Degrade an ok pose that contradicts the run so far: its matched points have disagreed for ten frames, planes turned otherwise, what was mapped
-    before the latest loss is not there, or the residuals contradict the calibration; and one that too few frames since that loss have confirmed:
-    frames in a row that are ok, and with which most of their planes agree (`planes_agree`)."""
+def judge_by_run(pose: Pose, planes_agree: bool, jump: str = "") -> Pose:
+    """Degrade an ok pose that contradicts the run so far: it is a `jump` (why, see `continuity.py`), its matched points have disagreed for ten
+    frames, planes turned otherwise, what was mapped before the latest loss or jump is not there, or the residuals contradict the calibration; and one
+    that too few frames since that loss or jump have confirmed: frames in a row that are ok, and with which most of their planes agree
+    (`planes_agree`)."""
     tests = contradiction_so_far, _found_elsewhere, contradicted_calibration
-    reason = next(filter(None, (test(pose) for test in tests)), "") if pose.status == OK else ""
+    reason = (jump or next(filter(None, (test(pose) for test in tests)), "")) if pose.status == OK else ""
     pose = replace(pose, status=DEGRADED, reason=reason) if reason else pose
     if not pose.lost_from or pose.confirmations == CONFIRMING:
         return pose
@@ -154,8 +155,10 @@ def with_disagreement(pose: Pose, previous: Pose, inliers: InlierStatistics, sta
 
 
 def since_loss(pose: Pose, previous: Pose) -> Pose:
-    """Give a pose the previous one's `lost_from`, `missing` and `confirmations`; the first lost one begins them anew."""
+    """Give a pose the previous one's `lost_from`, `missing` and `confirmations`; the first lost one begins them anew, and so did a jump."""
     if pose.status != LOST:
+        if pose.jumps:
+            return pose
         return replace(pose, lost_from=previous.lost_from, missing=previous.missing, confirmations=previous.confirmations)
     return replace(pose, lost_from=previous.lost_from if previous.status == LOST else pose.index)
 
@@ -270,4 +273,4 @@ def _found_elsewhere(pose: Pose) -> str:
     if not is_elsewhere(pose):
         return ""
     missing = f"{100.0 * pose.missing:.0f} % of what was mapped before and should be seen is missing"
-    return f"the camera was lost in frame {pose.lost_from}, and found again in a place that looks the same: of late {missing}"
+    return f"the camera was lost or jumped in frame {pose.lost_from}, and found again in a place that looks the same: of late {missing}"

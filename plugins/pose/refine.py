@@ -27,6 +27,7 @@ from trihedron.pipeline.core.types import (
     Translation,
 )
 from trihedron.plugins.mapping.reference_keyframe import reference_of, submap_of, transform_to_map
+from trihedron.plugins.pose.continuity import motion_since
 from trihedron.plugins.pose.decoupled_pose import FIRST_SIGMA, Decoupled, decoupled_pose
 from trihedron.plugins.pose.dynamic_objects import Selection, solve_with_static
 from trihedron.plugins.pose.judgement import (
@@ -111,10 +112,12 @@ class Refine(JudgementOptions):
         reference, T_reference_camera = reference_of(map, T, submap)
         stamps = rotation.index, rotation.stamp_ns
         pose = Pose(*stamps, T, solution.covariance, T_reference_camera, reference, counts, held, status.status, status.reason, submap)
-        pose = in_world(replace(pose, repeats=repeats, keyframe_covariance=shared), previous, solution, problem)
+        pose = replace(pose, repeats=repeats, keyframe_covariance=shared)
+        motion = motion_since(previous, pose)
+        pose = in_world(motion.of(pose), previous, solution, problem)
         pose = with_disagreement(with_turn_difference(pose, previous, tracks, planes), previous, inliers, static)
-        missing = missing_points(previous, submap, problem, T)
-        return judge_by_run(replace(since_loss(pose, previous), missing=missing), not inliers.most_planes_disagree)
+        missing = 0.0 if motion.jumps else missing_points(previous, submap, problem, T)
+        return judge_by_run(replace(since_loss(pose, previous), missing=missing), not inliers.most_planes_disagree, motion.jump)
 
     def localising(self) -> Refine:
         """Return the refinement of a camera that begins no sub-map: where the loaded map does not reach it stays lost."""

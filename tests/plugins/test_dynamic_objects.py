@@ -277,5 +277,5 @@ def test_what_was_mapped_before_the_camera_was_lost_is_still_there(world, map):
     assert known.status == "ok" and known.missing < 0.95 and known.lost_from == 7
     assert other.status == "degraded" and other.missing > 0.95
     missing = f"of late {100 * other.missing:.0f} % of what was mapped before and should be seen is missing"
-    assert other.reason == f"the camera was lost in frame 7, and found again in a place that looks the same: {missing}"
+    assert other.reason == f"the camera was lost or jumped in frame 7, and found again in a place that looks the same: {missing}"
     assert never.status == "ok" and (never.lost_from, never.missing) == (0, 0.0)
