@@ -1,5 +1,5 @@
-"""Contradictions between colour, depth and the map. A frame of whose matches most disagree is not mapped, and the map goes on to contradict those
-that follow; a pose of a contradiction that lasts for several frames is not ok, and not mapped either.
+"""Contradictions between colour, depth and the map. A frame of whose points and planes most disagree is not mapped, and the map goes on to contradict
+those that follow; a pose of a contradiction that lasts for several frames is not ok, and not mapped either where planes take part in it.
 
 Each of the latter is a share or a rotation averaged over the latest frames: matched points that disagree with their pose; matched planes that do,
 beyond what is usual in this run (with an imperfect calibration most may); and planes that turn otherwise than the camera (`plane_turns.py`)."""
@@ -28,10 +28,14 @@ def contradiction_so_far(pose: Pose) -> str:
 
 
 def contradicts_map(pose: Pose, matches: Matches) -> bool:
-    """Return True where three quarters of a frame's matches with the map disagree with its pose; not where none agrees, as of a pose without the
-    map."""
-    count, agreeing = len(matches.keypoints) + len(matches.segments) + len(matches.planes), int(pose.inliers.sum())
-    return pose.status == DEGRADED and 0 < agreeing < LEAST_AGREEING * count
+    """Return True where a frame contradicts the map in its planes, of which no majority agrees with the pose, and in three quarters of all matches,
+    or in most points of late. Where planes agree, points may be those of what moves, which is seldom flat and large. Not where no match agrees, as of
+    a pose without the map."""
+    points, lines, planes = len(matches.keypoints), len(matches.segments), len(matches.planes)
+    agreeing, agreeing_planes = int(pose.inliers.sum()), int(pose.inliers[2])
+    if pose.status != DEGRADED or not planes or 2 * agreeing_planes > planes:
+        return False
+    return bool(_disagreeing_points(pose)) or 0 < agreeing < LEAST_AGREEING * (points + lines + planes)
 
 
 def contradicting_depth(pose: Pose) -> str:

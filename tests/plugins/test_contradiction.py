@@ -60,10 +60,15 @@ def test_frames_with_few_planes_are_not_counted():
     assert not any(map(contradiction_so_far, few)) and np.array_equal(few[-1].plane_counts, clean.plane_counts)
 
 
-@pytest.mark.parametrize("agreeing, contradicts", [(9, True), (10, False), (0, False)])
-def test_a_frame_of_whose_matches_three_quarters_disagree_contradicts_the_map(agreeing, contradicts):
-    """Thirty matched points, eight lines and two planes; none agrees with a pose without the map."""
+@pytest.mark.parametrize(
+    "points, planes, of_late, contradicts",
+    [(9, 0, 0.3, True), (10, 0, 0.3, False), (8, 1, 0.3, True), (7, 2, 0.3, False), (20, 0, 0.6, True), (7, 2, 0.6, False), (0, 0, 0.3, False)],
+)
+def test_a_frame_of_whose_points_and_planes_most_disagree_contradicts_the_map(points, planes, of_late, contradicts):
+    """Thirty matched points, eight lines and two planes; where both planes agree, points may be those of what moves; none agrees with a pose without
+    the map."""
     matches = dataclasses.replace(NONE, keypoints=pairs(30), segments=pairs(8), planes=pairs(2))
-    pose = dataclasses.replace(FIRST, status="degraded", inliers=np.array([agreeing, 0, 0], np.int32))
+    pose = dataclasses.replace(FIRST, status="degraded", inliers=np.array([points, 0, planes], np.int32), disagreement=of_late)
     assert contradicts_map(pose, matches) is contradicts
     assert not contradicts_map(dataclasses.replace(pose, status="ok"), matches)
+    assert not contradicts_map(pose, dataclasses.replace(matches, planes=pairs(0)))
