@@ -71,7 +71,7 @@ def _accelerations(twist: F64, pose: Pose, previous: Pose) -> F64 | None:
     if previous.repeats or pose.submap != previous.submap or not (twist.any() and previous.twist.any()):
         return None
     seconds = _seconds(pose, previous)
-    variances = np.diagonal(pose.local_covariance + previous.local_covariance).reshape(2, 3).sum(axis=1)
+    variances = np.diagonal(pose.local_covariance + previous.local_covariance).reshape(2, 3).sum(axis=1).clip(0.0)  # below 0 by rounding
     changes = np.array([norm(part) for part in (twist - previous.twist).reshape(2, 3)])
     return np.asarray(np.maximum(changes / seconds - SIGMAS * np.sqrt(variances) / seconds**2, 0.0))
 

@@ -78,6 +78,13 @@ def test_poses_that_are_uncertain_do_not_jump():
     assert {pose.status for pose in walk(positions, covariance=1e-2 * np.eye(6))} == {"ok"}
 
 
+def test_a_pose_that_is_exact_but_for_rounding_does_not_jump():
+    """As the first one of a sub-map, whose covariance less that of the map is not exactly zero."""
+    more = dict(covariance=np.eye(6), map_covariance=(1.0 + 1e-12) * np.eye(6))
+    poses = walk(STEADY[:20], **more)
+    assert {pose.status for pose in poses} == {"ok"} and np.isfinite(poses[-1].usual_accelerations).all()
+
+
 def test_the_velocity_after_repeated_images_is_that_since_they_were_taken():
     """Three images that repeat an earlier one while the camera goes on at 0.9 m/s."""
     before = walk(0.03 * np.arange(1, 31))[-1]
