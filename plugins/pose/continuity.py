@@ -7,14 +7,14 @@ jump: what comes after it is ok once several frames in a row have confirmed it (
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from trihedron.pipeline.core.geometry import invert
 from trihedron.pipeline.core.lie import log_se3
 from trihedron.pipeline.core.linalg import matmul, norm
-from trihedron.pipeline.core.types import F64, LOST, Pose
+from trihedron.pipeline.core.types import DEGRADED, F64, LOST, OK, Pose
 
 CARRIED = np.array([50.0, 150.0])  # m/s² and rad/s²: at most 37 and 46 in 81 clean runs of six sequences and five simulated sensors
 UNUSUAL = 3.0  # times the largest accelerations of late
@@ -27,33 +27,25 @@ LONGEST_S = 1.0  # between two frames that a velocity is taken from
 UNITS = "m/s²", "rad/s²"
 
 
-@dataclass(frozen=True)
-class Motion:
-    """Motion of the camera since the previous pose: the velocity (6,), `Pose.jumps` and `Pose.usual_accelerations` with this frame, and why it is a
-    jump, empty where it is none."""
-
-    twist: F64
-    usual_accelerations: F64
-    jumps: int = 0
-    jump: str = ""
-
-    def of(self, pose: Pose) -> Pose:
-        """Give a pose this motion; a jump begins anew what a pose keeps since the latest loss."""
-        lost_from = pose.index if self.jumps else pose.lost_from
-        return replace(pose, twist=self.twist, usual_accelerations=self.usual_accelerations, jumps=self.jumps, lost_from=lost_from)
-
-
-def motion_since(previous: Pose, pose: Pose) -> Motion:
-    """Return the motion to a pose (with `covariance` relative to the landmarks near it) from the previous one in the same map."""
+def with_motion(pose: Pose, previous: Pose) -> Pose:
+    """Give a pose (with `covariance` relative to the landmarks near it) its motion since the previous one: velocity, `jumps` and
+    `usual_accelerations`. An ok pose that is a jump is degraded."""
     if pose.repeats:
-        return Motion(previous.twist, previous.usual_accelerations)
+        return replace(pose, twist=previous.twist, usual_accelerations=previous.usual_accelerations)
     twist = _velocity(pose, previous)
     accelerations = _accelerations(twist, pose, previous)
     if accelerations is None:
-        return Motion(twist, previous.usual_accelerations)
-    jump = _jump(accelerations, previous)
-    jumps = previous.jumps + 1 if jump else 0
-    return Motion(previous.twist if 0 < jumps <= THERE_AND_BACK else twist, _usual(accelerations, previous, bool(jump)), jumps, jump)
+        return replace(pose, twist=twist, usual_accelerations=previous.usual_accelerations)
+    reason = _jump(accelerations, previous)
+    pose = replace(pose, twist=twist, usual_accelerations=_usual(accelerations, previous, bool(reason)))
+    return _jumped(pose, previous, reason) if reason else pose
+
+
+def _jumped(pose: Pose, previous: Pose, reason: str) -> Pose:
+    """Count a jump in a pose, which is not ok then. The first ones in a row leave the velocity as it was."""
+    jumps = previous.jumps + 1
+    pose = replace(pose, jumps=jumps, twist=previous.twist if jumps <= THERE_AND_BACK else pose.twist)
+    return replace(pose, status=DEGRADED, reason=reason) if pose.status == OK else pose
 
 
 def _velocity(pose: Pose, previous: Pose) -> F64:
@@ -77,7 +69,8 @@ def _accelerations(twist: F64, pose: Pose, previous: Pose) -> F64 | None:
 
 
 def _jump(accelerations: F64, previous: Pose) -> str:
-    """Return why accelerations (2,) are those of a jump: one is far beyond that of a camera that is carried, and beyond those usual in this run."""
+    """Return why accelerations (2,) are those of a jump, empty where they are not: one is far beyond that of a camera that is carried, and beyond
+    those usual in this run."""
     frames, *usual = previous.usual_accelerations.tolist()
     far = accelerations / np.maximum(CARRIED, UNUSUAL * np.array(usual))
     worst = int(np.argmax(far))

@@ -128,13 +128,12 @@ def status_by_images(status: TrackingStatus, evidence: Evidence, repeats: int) -
     return status
 
 
-def judge_by_run(pose: Pose, planes_agree: bool, jump: str = "") -> Pose:
-    """Degrade an ok pose that contradicts the run so far: it is a `jump` (why, see `continuity.py`), its matched points have disagreed for ten
-    frames, planes turned otherwise, what was mapped before the latest loss or jump is not there, or the residuals contradict the calibration; and one
-    that too few frames since that loss or jump have confirmed: frames in a row that are ok, and with which most of their planes agree
-    (`planes_agree`)."""
+def judge_by_run(pose: Pose, planes_agree: bool) -> Pose:
+    """Degrade an ok pose that contradicts the run so far: its matched points have disagreed for ten frames, planes turned otherwise, what was mapped
+    before the latest loss or jump is not there, or the residuals contradict the calibration; and one that too few frames since that loss or jump have
+    confirmed: frames in a row that are ok, and with which most of their planes agree (`planes_agree`)."""
     tests = contradiction_so_far, _found_elsewhere, contradicted_calibration
-    reason = (jump or next(filter(None, (test(pose) for test in tests)), "")) if pose.status == OK else ""
+    reason = next(filter(None, (test(pose) for test in tests)), "") if pose.status == OK else ""
     pose = replace(pose, status=DEGRADED, reason=reason) if reason else pose
     if not pose.lost_from or pose.confirmations == CONFIRMING:
         return pose
@@ -155,26 +154,25 @@ def with_disagreement(pose: Pose, previous: Pose, inliers: InlierStatistics, sta
 
 
 def since_loss(pose: Pose, previous: Pose) -> Pose:
-    """Give a pose the previous one's `lost_from`, `missing` and `confirmations`; the first lost one begins them anew, and so did a jump."""
-    if pose.status != LOST:
-        if pose.jumps:
-            return pose
-        return replace(pose, lost_from=previous.lost_from, missing=previous.missing, confirmations=previous.confirmations)
-    return replace(pose, lost_from=previous.lost_from if previous.status == LOST else pose.index)
+    """Give a pose the previous one's `lost_from`, `missing` and `confirmations`; the first lost one, and a jump, begin them anew."""
+    if pose.jumps or (pose.status == LOST and previous.status != LOST):
+        return replace(pose, lost_from=pose.index)
+    return replace(pose, lost_from=previous.lost_from, missing=previous.missing, confirmations=previous.confirmations)
 
 
-def missing_points(previous: Pose, submap: int, problem: MapAlignment, T_world_camera: F64) -> float:
-    """Return the moving average of the share of points mapped before the latest loss that should be matched and are not: the surface that they lie on
-    is observed, from about where they were mapped. It begins anew where the sub-map of the camera was merged or split since the previous pose."""
+def with_missing_points(pose: Pose, previous: Pose, problem: MapAlignment) -> Pose:
+    """Give a pose the moving average of the share of points mapped before the latest loss or jump that should be matched and are not: the surface
+    that they lie on is observed, from about where they were mapped. It begins anew where the sub-map of the camera was merged or split since the
+    previous pose."""
     map, visible = problem.map, problem.matches.visible_points
-    if not previous.lost_from or submap != previous.submap:
-        return 0.0
-    old = visible[map.keyframes.rows("index", map.points.rows("first", visible)) < previous.lost_from]
-    expected = old[_is_observed(problem, old, T_world_camera)]
+    if not pose.lost_from or pose.submap != previous.submap:
+        return replace(pose, missing=0.0)
+    old = visible[map.keyframes.rows("index", map.points.rows("first", visible)) < pose.lost_from]
+    expected = old[_is_observed(problem, old, pose.T_world_camera)]
     if not len(expected):
-        return previous.missing
+        return pose
     missing = 1.0 - float(np.isin(expected, problem.matches.keypoints[:, 1]).mean())
-    return previous.missing + (missing - previous.missing) * len(expected) / (len(expected) + MISSING_POINTS)
+    return replace(pose, missing=pose.missing + (missing - pose.missing) * len(expected) / (len(expected) + MISSING_POINTS))
 
 
 def _is_observed(problem: MapAlignment, points: I32, T_world_camera: F64) -> NDArray[np.bool_]:

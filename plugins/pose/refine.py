@@ -27,7 +27,7 @@ from trihedron.pipeline.core.types import (
     Translation,
 )
 from trihedron.plugins.mapping.reference_keyframe import reference_of, submap_of, transform_to_map
-from trihedron.plugins.pose.continuity import motion_since
+from trihedron.plugins.pose.continuity import with_motion
 from trihedron.plugins.pose.decoupled_pose import FIRST_SIGMA, Decoupled, decoupled_pose
 from trihedron.plugins.pose.dynamic_objects import Selection, solve_with_static
 from trihedron.plugins.pose.judgement import (
@@ -35,13 +35,13 @@ from trihedron.plugins.pose.judgement import (
     JudgementOptions,
     is_found_again,
     judge_by_run,
-    missing_points,
     reason_to_be_lost,
     repeated_images,
     since_loss,
     status_by_images,
     status_by_matches,
     with_disagreement,
+    with_missing_points,
 )
 from trihedron.plugins.pose.map_alignment import MapAlignment
 from trihedron.plugins.pose.world_uncertainty import in_world, keyframe_covariance, propagate_world_covariance
@@ -113,11 +113,10 @@ class Refine(JudgementOptions):
         stamps = rotation.index, rotation.stamp_ns
         pose = Pose(*stamps, T, solution.covariance, T_reference_camera, reference, counts, held, status.status, status.reason, submap)
         pose = replace(pose, repeats=repeats, keyframe_covariance=shared)
-        motion = motion_since(previous, pose)
-        pose = in_world(motion.of(pose), previous, solution, problem)
+        pose = in_world(with_motion(pose, previous), previous, solution, problem)
         pose = with_disagreement(with_turn_difference(pose, previous, tracks, planes), previous, inliers, static)
-        missing = 0.0 if motion.jumps else missing_points(previous, submap, problem, T)
-        return judge_by_run(replace(since_loss(pose, previous), missing=missing), not inliers.most_planes_disagree, motion.jump)
+        pose = with_missing_points(since_loss(pose, previous), previous, problem)
+        return judge_by_run(pose, not inliers.most_planes_disagree)
 
     def localising(self) -> Refine:
         """Return the refinement of a camera that begins no sub-map: where the loaded map does not reach it stays lost."""
@@ -147,8 +146,12 @@ class Refine(JudgementOptions):
         number = int(map.keyframes.column("submap").max(initial=0)) + 1
         reason = f"first frame of sub-map {number}: relocalisation failed for {unrecognised} frames"
         new = replace(start, covariance=FIRST_SIGMA**2 * np.eye(6), status=DEGRADED, reason=reason)
-        pose, information = new.to_pose(rotation, map, submap=number), previous.calibration_information
-        pose = replace(pose, calibration_information=information, calibration_score=previous.calibration_score)
+        pose = replace(
+            new.to_pose(rotation, map, submap=number),
+            calibration_information=previous.calibration_information,
+            calibration_score=previous.calibration_score,
+            usual_accelerations=previous.usual_accelerations,
+        )
         return since_loss(pose, previous)
 
     def _unrefined(self, pose: Pose, previous: Pose) -> Pose:

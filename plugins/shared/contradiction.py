@@ -62,10 +62,15 @@ def plane_counts(previous: Pose, matched: int, agreed: int) -> F64:
 
 
 def with_averages_of(previous: Pose, pose: Pose) -> Pose:
-    """Give a pose that the map did not refine, and that measured nothing to average, the averages of the previous one. Only the mean of how planes
-    turn otherwise begins anew."""
-    usual = previous.usual_turn_difference
-    return replace(pose, disagreement=previous.disagreement, plane_counts=previous.plane_counts, usual_turn_difference=usual)
+    """Give a pose that the map did not refine, and that measured nothing to average, what the previous one shows of the run so far. Only the mean of
+    how planes turn otherwise begins anew."""
+    return replace(
+        pose,
+        disagreement=previous.disagreement,
+        plane_counts=previous.plane_counts,
+        usual_turn_difference=previous.usual_turn_difference,
+        usual_accelerations=previous.usual_accelerations,
+    )
 
 
 def _disagreeing_points(pose: Pose) -> str:

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from trihedron.pipeline.core.types import Pose
-from trihedron.plugins.pose.continuity import motion_since
+from trihedron.plugins.pose.continuity import with_motion
 from trihedron.plugins.pose.judgement import judge_by_run, since_loss
+from trihedron.plugins.shared.contradiction import with_averages_of
 
 PERIOD_NS = 33_333_333
 FIRST = Pose(1, 0, np.eye(4), 1e-6 * np.eye(6), np.eye(4), -1, np.zeros(3, np.int32), 0, "ok", "")
@@ -19,8 +20,7 @@ def follow(pose, position, turn_deg=0.0, **more):
     T[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
     T[0, 3] = position
     found = dataclasses.replace(FIRST, index=pose.index + 1, stamp_ns=pose.stamp_ns + PERIOD_NS, T_world_camera=T, **more)
-    motion = motion_since(pose, found)
-    return judge_by_run(since_loss(motion.of(found), pose), planes_agree=True, jump=motion.jump)
+    return judge_by_run(since_loss(with_motion(found, pose), pose), planes_agree=True)
 
 
 def walk(positions, **more):
@@ -63,6 +63,16 @@ def test_a_camera_that_turns_at_once_has_jumped():
     poses = walk(STEADY[:30])
     turned = follow(poses[-1], STEADY[30], turn_deg=90.0)
     assert turned.reason == "a jump: the motion since the previous frame takes 1405 rad/s², usually at most 0"
+
+
+def test_what_is_usual_is_still_known_after_a_loss():
+    """A lost frame in a walk, found again in the next, and an image of half a metre back four frames later."""
+    walked = walk(STEADY[:30])[-1]
+    lost = dataclasses.replace(FIRST, index=walked.index + 1, stamp_ns=walked.stamp_ns + PERIOD_NS, status="lost")
+    poses = [since_loss(with_averages_of(walked, lost), walked)]
+    for position in [*STEADY[31:35], STEADY[35] - 0.5]:
+        poses.append(follow(poses[-1], position))
+    assert [pose.jumps for pose in poses] == [0, 0, 0, 0, 0, 1]
 
 
 @pytest.mark.parametrize("steps", [np.random.default_rng(1).uniform(-0.4, 0.4, 60), np.tile([0.3, -0.2, 0.1], 20)])
