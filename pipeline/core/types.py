@@ -332,14 +332,16 @@ class Pose(Value):
     camera frame) by which planes turned more than the pose, as a moving average over ten frames, and `usual_turn_difference` its usual size in one
     frame, 0.3° before the first. `plane_counts` counts matched planes, those that disagree with their frame's pose and all: of the latest 60 or so
     and of the latest 600 (rows), with weights that decrease with age. `usual_accelerations` are the number of frames, at most ten, whose linear
-    (m/s²) and angular (rad/s²) acceleration is known, and the largest of these, less 1 % for each frame since.
+    (m/s²) and angular (rad/s²) acceleration is known, and the largest of these, less 1 % for each frame since. `scale_difference` is the logarithm
+    of the ratio by which nine of ten distances between matched points are larger than in the map, or below 0 smaller (0 where neither is so), as a
+    moving average over three frames.
 
     Five fields are what the pose's error owes to an imperfect calibration (`plugins.shared.calibration_error`, which defines the parameters and their
     units): `sensitivity` is the derivative of the error by them, `calibration_information` and `calibration_score` the information of the residuals
     on them so far. `twist` is the camera's velocity (m/s, rad/s) in its own frame, `reference_twist` that of the reference keyframe.
     `depth_scale_sigma` is the relative standard deviation of the scale of all depths, of which residuals tell nothing."""
 
-    version: ClassVar[int] = 9
+    version: ClassVar[int] = 10
 
     T_world_camera: Annotated[F64, Shape(4, 4), Rotations()]
     covariance: Annotated[F64, Shape(6, 6), Finite()]
@@ -372,6 +374,7 @@ class Pose(Value):
     confirmations: Annotated[int, Within(0, 2**31)] = 0
     jumps: int = 0
     usual_accelerations: Annotated[F64, Shape(3), Finite()] = field(default_factory=lambda: np.zeros(3))
+    scale_difference: Annotated[float, Finite()] = 0.0
 
     @property
     def local_covariance(self) -> F64:

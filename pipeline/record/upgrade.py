@@ -49,6 +49,7 @@ ADDED_FIELDS: dict[tuple[str, int], dict[str, Any]] = {  # type and older versio
     ("Pose", 6): {"plane_counts": np.zeros((2, 2))},
     ("Pose", 7): {"confirmations": 0},
     ("Pose", 8): {"jumps": 0, "usual_accelerations": np.zeros(3)},
+    ("Pose", 9): {"scale_difference": 0.0},
     ("Tracks", 1): {"repeated": 0.0},
     ("Map", 5): {"loop_closed": 0},
     ("Building", 1): {"doubts": np.zeros((0, 3))},

@@ -12,7 +12,7 @@ from trihedron.pipeline.core.linalg import eigvalsh, matmul
 from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat, PositiveInt, Share, check_increasing
 from trihedron.pipeline.core.types import F64, Frame, Map, Matches, Planes, Pose, Table
 from trihedron.plugins.mapping.covisibility_graph import WEIGHTS, newest_keyframes
-from trihedron.plugins.shared.contradiction import contradicting_depth, contradicts_map
+from trihedron.plugins.shared.contradiction import contradicting_depth
 
 UNCHANGED = 0.25  # of the view change of a keyframe, that suffices after max_frames: a camera at rest adds none
 
@@ -44,7 +44,7 @@ def needs_keyframe(options: KeyframeOptions, frame: Frame, pose: Pose, planes: P
     keyframes, newest = map.keyframes, newest_keyframes(map, 1).tolist()
     if not newest or keyframes.row("submap", newest[0]) != pose.submap:
         return True
-    if pose.repeats or contradicting_depth(pose) or (matches is not None and contradicts_map(pose, matches)):
+    if pose.repeats or contradicting_depth(pose):
         return False
     frames = frame.index - int(keyframes.row("index", newest[0]))
     spans = [keyframes.row(kind.span_column, newest[0]).tolist() for kind in WEIGHTS]

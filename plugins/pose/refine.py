@@ -46,6 +46,7 @@ from trihedron.plugins.pose.judgement import (
 from trihedron.plugins.pose.map_alignment import MapAlignment
 from trihedron.plugins.pose.world_uncertainty import in_world, keyframe_covariance, propagate_world_covariance
 from trihedron.plugins.shared.contradiction import with_averages_of
+from trihedron.plugins.shared.distance_scale import with_scale_difference
 from trihedron.plugins.shared.plane_turns import with_turn_difference
 from trihedron.plugins.shared.pose_optimizer import PoseSolution
 
@@ -115,6 +116,7 @@ class Refine(JudgementOptions):
         pose = replace(pose, repeats=repeats, keyframe_covariance=shared)
         pose = in_world(with_motion(pose, previous), previous, solution, problem)
         pose = with_disagreement(with_turn_difference(pose, previous, tracks, planes), previous, inliers, static)
+        pose = with_scale_difference(pose, previous, keypoints, matches, map)
         pose = with_missing_points(since_loss(pose, previous), previous, problem)
         return judge_by_run(pose, not inliers.most_planes_disagree)
 

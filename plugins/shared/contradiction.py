@@ -1,8 +1,8 @@
-"""Contradictions between colour, depth and the map. A frame of whose points and planes most disagree is not mapped, and the map goes on to contradict
-those that follow; a pose of a contradiction that lasts for several frames is not ok, and not mapped either where planes take part in it.
+"""Contradictions between colour, depth and the map that last for several frames: such a pose is not ok, and is not mapped.
 
-Each of the latter is a share or a rotation averaged over the latest frames: matched points that disagree with their pose; matched planes that do,
-beyond what is usual in this run (with an imperfect calibration most may); and planes that turn otherwise than the camera (`plane_turns.py`)."""
+Each is a share, a ratio or a rotation averaged over the latest frames: matched points that disagree with their pose; matched planes that do, beyond
+what is usual in this run (with an imperfect calibration most may); planes that turn otherwise than the camera (`plane_turns.py`); and distances
+between points that are not those of the map (`distance_scale.py`)."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from trihedron.pipeline.core.types import DEGRADED, F64, Matches, Pose
+from trihedron.pipeline.core.types import F64, Pose
+from trihedron.plugins.shared.distance_scale import contradicting_scale
 from trihedron.plugins.shared.plane_turns import contradicting_turn
 
 AVERAGED_FRAMES = 10  # that the disagreement of points is averaged over
 MOST_DISAGREEMENT = 0.5  # of points: more is no moment of blur and nobody who walks by; at most 0.35 of five cameras as they are stated
-LEAST_AGREEING = 0.25  # of the matches of a frame that is mapped: landmarks made from another one would agree with the next frame, right or wrong
 AVERAGED_PLANES = np.array([[60.0], [600.0]])  # that their disagreement of late, and the usual one, are averaged over
 LEAST_PLANES = 8  # of a frame that are counted: of fewer, two that are matched wrongly from frame to frame are most
 UNUSUAL = 0.2  # that a plane counts in what is usual while they disagree
@@ -27,21 +27,10 @@ def contradiction_so_far(pose: Pose) -> str:
     return _disagreeing_points(pose) or contradicting_depth(pose)
 
 
-def contradicts_map(pose: Pose, matches: Matches) -> bool:
-    """Return True where a frame contradicts the map in its planes, of which no majority agrees with the pose, and in three quarters of all matches,
-    or in most points of late. Where planes agree, points may be those of what moves, which is seldom flat and large. Not where no match agrees, as of
-    a pose without the map."""
-    points, lines, planes = len(matches.keypoints), len(matches.segments), len(matches.planes)
-    agreeing, agreeing_planes = int(pose.inliers.sum()), int(pose.inliers[2])
-    if pose.status != DEGRADED or not planes or 2 * agreeing_planes > planes:
-        return False
-    return bool(_disagreeing_points(pose)) or 0 < agreeing < LEAST_AGREEING * (points + lines + planes)
-
-
 def contradicting_depth(pose: Pose) -> str:
-    """Return why depth contradicts colour up to a pose, empty where it does not. Where most points disagree, something may move over half the image;
-    planes are large and seldom move."""
-    return _disagreeing_planes(pose) or contradicting_turn(pose)
+    """Return why depth contradicts colour or the map up to a pose, empty where it does not. Where most points disagree, something may move over half
+    the image; planes are large and seldom move, and what moves keeps its size."""
+    return _disagreeing_planes(pose) or contradicting_turn(pose) or contradicting_scale(pose)
 
 
 def disagreement(previous: Pose, matched: int, agreed: int) -> float:
@@ -70,6 +59,7 @@ def with_averages_of(previous: Pose, pose: Pose) -> Pose:
         plane_counts=previous.plane_counts,
         usual_turn_difference=previous.usual_turn_difference,
         usual_accelerations=previous.usual_accelerations,
+        scale_difference=previous.scale_difference,
     )
 
 

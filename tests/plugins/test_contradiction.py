@@ -5,19 +5,11 @@ import dataclasses
 import numpy as np
 import pytest
 
-from trihedron.pipeline.core.types import Matches, Pose
+from trihedron.pipeline.core.types import Pose
 from trihedron.plugins.pose.judgement import judge_by_run
-from trihedron.plugins.shared.contradiction import contradiction_so_far, contradicts_map, plane_counts
+from trihedron.plugins.shared.contradiction import contradiction_so_far, plane_counts
 
 FIRST = Pose(0, 0, np.eye(4), np.eye(6), np.eye(4), -1, np.zeros(3, np.int32), 0, "ok", "")
-
-
-def pairs(count):
-    """So many pairs of rows."""
-    return np.zeros((count, 2), np.int32)
-
-
-NONE = Matches(0, 0, 0, *[pairs(0)] * 5, *[np.zeros(0, np.int32)] * 2)
 
 
 def followed(pose, frames, agreed, matched=10):
@@ -58,17 +50,3 @@ def test_frames_with_few_planes_are_not_counted():
     clean = followed(FIRST, 40, 10)[-1]
     few = followed(clean, 60, 1, matched=5)
     assert not any(map(contradiction_so_far, few)) and np.array_equal(few[-1].plane_counts, clean.plane_counts)
-
-
-@pytest.mark.parametrize(
-    "points, planes, of_late, contradicts",
-    [(9, 0, 0.3, True), (10, 0, 0.3, False), (8, 1, 0.3, True), (7, 2, 0.3, False), (20, 0, 0.6, True), (7, 2, 0.6, False), (0, 0, 0.3, False)],
-)
-def test_a_frame_of_whose_points_and_planes_most_disagree_contradicts_the_map(points, planes, of_late, contradicts):
-    """Thirty matched points, eight lines and two planes; where both planes agree, points may be those of what moves; none agrees with a pose without
-    the map."""
-    matches = dataclasses.replace(NONE, keypoints=pairs(30), segments=pairs(8), planes=pairs(2))
-    pose = dataclasses.replace(FIRST, status="degraded", inliers=np.array([points, 0, planes], np.int32), disagreement=of_late)
-    assert contradicts_map(pose, matches) is contradicts
-    assert not contradicts_map(dataclasses.replace(pose, status="ok"), matches)
-    assert not contradicts_map(pose, dataclasses.replace(matches, planes=pairs(0)))
