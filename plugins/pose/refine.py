@@ -116,7 +116,7 @@ class Refine(JudgementOptions):
         pose = replace(pose, repeats=repeats, keyframe_covariance=shared)
         pose = in_world(with_motion(pose, previous), previous, solution, problem)
         pose = with_disagreement(with_turn_difference(pose, previous, tracks, planes), previous, inliers, static)
-        pose = with_scale_difference(pose, previous, keypoints, matches, map)
+        pose = with_scale_difference(pose, previous, problem.terms(T)[0].positions_m, keypoints.points_m[matches.keypoints[:, 0]])
         pose = with_missing_points(since_loss(pose, previous), previous, problem)
         return judge_by_run(pose, not inliers.most_planes_disagree)
 

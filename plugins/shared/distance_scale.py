@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from trihedron.pipeline.core.types import F32, F64, Keypoints, Map, Matches, Pose
+from trihedron.pipeline.core.types import F32, F64, Pose
 
 LEAST_POINTS = 20  # with depth, that distances are measured between
 APART = 2, 3, 5  # each point is paired with those half, a third and a fifth of all points further on
@@ -20,10 +20,9 @@ LEAST = 0.005  # of a distance, that is worth a doubt
 TINY_M = 1e-6
 
 
-def with_scale_difference(pose: Pose, previous: Pose, keypoints: Keypoints, matches: Matches, map: Map) -> Pose:
-    """Give a pose the moving average of how much most distances between matched points differ from those in the map; the previous one's where that
-    is not measured. A new sub-map begins it."""
-    known, found = map.points.rows("position_m", matches.keypoints[:, 1]), keypoints.points_m[matches.keypoints[:, 0]]
+def with_scale_difference(pose: Pose, previous: Pose, known: F64, found: F32) -> Pose:
+    """Give a pose the moving average of how much most distances between its matched points, (n, 3) `found` by the camera, differ from those in the
+    map, where they are `known`; the previous one's where that is not measured. A new sub-map begins it."""
     before = previous.scale_difference if previous.submap == pose.submap else 0.0
     difference = scale_difference(known, found)
     return replace(pose, scale_difference=before if difference is None else before + (difference - before) / AVERAGED_FRAMES)
@@ -34,10 +33,9 @@ def scale_difference(known: F64, found: F32) -> float | None:
     the same points where they are `known`; 0.0 where some are larger and some smaller, None for few points. NaN are none. Of all distances the
     longer half is compared, which noise changes least."""
     finite = np.isfinite(found[:, 2])
-    known, found = known[finite], found[finite]
-    if len(found) < LEAST_POINTS:
+    if np.count_nonzero(finite) < LEAST_POINTS:
         return None
-    before, now = (np.concatenate([_distances(points, len(points) // share) for share in APART]) for points in (known, found))
+    before, now = _distances(known[finite]), _distances(found[finite].astype(np.float64))
     longer = np.maximum(before, now)
     counted = (longer >= np.median(longer)) & (np.minimum(before, now) > TINY_M)
     ratios = np.log(now[counted] / before[counted])
@@ -56,6 +54,6 @@ def contradicting_scale(pose: Pose) -> str:
     return f"depth and map contradict each other: of late most distances between points are {least:.1f} % {side} than in the map, or more"
 
 
-def _distances(points: F64 | F32, further: int) -> F64:
-    """Distances (n,) of points (n, 3) to those so many rows further on."""
-    return np.asarray(np.linalg.norm(points.astype(np.float64) - np.roll(points, further, axis=0), axis=1))
+def _distances(points: F64) -> F64:
+    """Distances (3 n,) of points (n, 3) to those they are paired with."""
+    return np.concatenate([np.linalg.norm(points - np.roll(points, len(points) // share, axis=0), axis=1) for share in APART])
