@@ -10,7 +10,8 @@ status, with its figures:
   camera's calibration (`calibration_uncertainty.py`). A frame that comes after a contradiction, and that the map does not support, is lost.
 - **Continuity**: the rotation was measured, and the frame continues the previous one, or the map knows its details: of a place that is built alike,
   walls and lines agree, and points do not. A jump from a predicted rotation is verified by the map alone. The place where a camera is found again, or
-  where it is after a change of motion that nothing carried makes (`continuity.py`), three frames in a row verify with which their planes agree.
+  where it is after a change of motion that nothing carried makes (`continuity.py`), and which the map alone determines, three frames in a row verify
+  with which their planes agree.
   It keeps finding what was mapped before it was lost; in a room like the one it was taken to be in, it does until it leaves.
 - **Freshness**: an image that repeats the one before, wholly or for the most part, measures nothing, nor does one whose colour repeats it and whose
   depth does not.

@@ -101,7 +101,7 @@ class Refine(JudgementOptions):
             searched = relocalise is not None and translation.estimated
             return self._stay_lost(start, rotation, previous, searched, map, submap)
         if reason := reason_to_be_lost(self, evidence, start.status):
-            return self._unrefined(replace(start, status=LOST, reason=reason).to_pose(rotation, map, submap=submap), previous)
+            return self._lost(start, reason, rotation, previous, map, submap)
         if not inliers.total:
             reason = "nothing of the map was found, pose from the previous frame"
             return self._unrefined(start.to_pose(rotation, map, reason, submap), previous)
@@ -114,7 +114,11 @@ class Refine(JudgementOptions):
         stamps = rotation.index, rotation.stamp_ns
         pose = Pose(*stamps, T, solution.covariance, T_reference_camera, reference, counts, held, status.status, status.reason, submap)
         pose = replace(pose, repeats=repeats, keyframe_covariance=shared)
-        pose = in_world(with_motion(pose, previous), previous, solution, problem)
+        pose = with_motion(pose, previous)
+        if pose.jumps and not is_found_again(self, evidence):
+            reason = f"the camera jumped, and the map does not determine the pose by itself: only {inliers.total} of {inliers.matches} matches agree"
+            return self._lost(start, reason, rotation, previous, map, submap)
+        pose = in_world(pose, previous, solution, problem)
         pose = with_disagreement(with_turn_difference(pose, previous, tracks, planes), previous, inliers, static)
         pose = with_scale_difference(pose, previous, problem.terms(T)[0].positions_m, keypoints.points_m[matches.keypoints[:, 0]])
         pose = with_missing_points(since_loss(pose, previous), previous, problem)
@@ -155,6 +159,10 @@ class Refine(JudgementOptions):
             usual_accelerations=previous.usual_accelerations,
         )
         return since_loss(pose, previous)
+
+    def _lost(self, start: Decoupled, reason: str, rotation: Rotation, previous: Pose, map: Map, submap: int) -> Pose:
+        """Return the pose of a frame that is lost for a reason."""
+        return self._unrefined(replace(start, status=LOST, reason=reason).to_pose(rotation, map, submap=submap), previous)
 
     def _unrefined(self, pose: Pose, previous: Pose) -> Pose:
         """Give a pose that the map did not refine what it takes over from the previous one."""

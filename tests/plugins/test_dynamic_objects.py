@@ -263,6 +263,19 @@ def test_what_contradicts_is_not_continued_without_the_map(world, map):
     assert continued.status == "degraded"
 
 
+def test_a_jump_needs_the_map(world, map):
+    """A frame to which the camera moved back at 30 m/s after it had gone on: with all matches, and with one of each kind, by which the map would go
+    on from anywhere."""
+    start, features, matches = matched(world, map)
+    few = dataclasses.replace(matches, keypoints=matches.keypoints[:1], segments=matches.segments[:1])
+    carried, twist = np.array([10.0, 1.0, 1.0]), np.array([-30.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    before = dataclasses.replace(pose_of(camera_at(STEP - 1), STEP - 1), twist=twist, usual_accelerations=carried)
+    found, lost = (Refine()(world.frame(STEP).camera, *start, None, some, *features, before, map, None) for some in (matches, few))
+    assert found.status == "degraded" and found.reason.startswith("a jump: the motion since the previous frame takes ")
+    assert lost.status == "lost" and lost.lost_from == STEP
+    assert lost.reason == "the camera jumped, and the map does not determine the pose by itself: only 5 of 5 matches agree"
+
+
 def test_what_was_mapped_before_the_camera_was_lost_is_still_there(world, map):
     """A frame that matches what it should of the map, and one that matches a tenth of it, after a loss in frame 7 and after none."""
     start, features, matches = matched(world, map)
