@@ -330,8 +330,9 @@ class Pose(Value):
     should have been matched since the camera was found again and were not, as a moving average over a thousand of them; `confirmations` the number of
     frames in a row since, at most three, that would be ok but for the loss, and with which planes agree. `turn_difference` is the rotation (rad,
     camera frame) by which planes turned more than the pose, as a moving average over ten frames, and `usual_turn_difference` its usual size in one
-    frame, 0.3° before the first. `plane_counts` counts matched planes, those that disagree with their frame's pose and all: of the latest 60 or so
-    and of the latest 600 (rows), with weights that decrease with age. `usual_accelerations` are the number of frames, at most ten, whose linear
+    frame, 0.3° before the first. `plane_offsets` are how far half of the area of the matched planes lies at least from where the map has them, as a
+    share of its distance, as moving averages over ten images full of matched planes and over a hundred, and how many such images there were, at most
+    a hundred. `usual_accelerations` are the number of frames, at most ten, whose linear
     (m/s²) and angular (rad/s²) acceleration is known, and the largest of these, less 1 % for each frame since. `scale_difference` is the logarithm
     of the ratio by which nine of ten distances between matched points are larger than in the map, or below 0 smaller (0 where neither is so), as a
     moving average over three frames.
@@ -341,7 +342,7 @@ class Pose(Value):
     on them so far. `twist` is the camera's velocity (m/s, rad/s) in its own frame, `reference_twist` that of the reference keyframe.
     `depth_scale_sigma` is the relative standard deviation of the scale of all depths, of which residuals tell nothing."""
 
-    version: ClassVar[int] = 10
+    version: ClassVar[int] = 11
 
     T_world_camera: Annotated[F64, Shape(4, 4), Rotations()]
     covariance: Annotated[F64, Shape(6, 6), Finite()]
@@ -370,7 +371,7 @@ class Pose(Value):
     depth_scale_sigma: Annotated[float, Within(0.0, 1.0)] = 0.0
     turn_difference: Annotated[F64, Shape(3), Finite()] = field(default_factory=lambda: np.zeros(3))
     usual_turn_difference: Annotated[float, Within(0.0, np.pi)] = USUAL_TURN_DIFFERENCE
-    plane_counts: Annotated[F64, Shape(2, 2), Finite()] = field(default_factory=lambda: np.zeros((2, 2)))
+    plane_offsets: Annotated[F64, Shape(3), Finite()] = field(default_factory=lambda: np.zeros(3))
     confirmations: Annotated[int, Within(0, 2**31)] = 0
     jumps: int = 0
     usual_accelerations: Annotated[F64, Shape(3), Finite()] = field(default_factory=lambda: np.zeros(3))

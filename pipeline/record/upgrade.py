@@ -46,10 +46,11 @@ ADDED_FIELDS: dict[tuple[str, int], dict[str, Any]] = {  # type and older versio
     },
     ("Pose", 4): {"keyframe_covariance": np.zeros((6, 6))},
     ("Pose", 5): {"turn_difference": np.zeros(3), "usual_turn_difference": USUAL_TURN_DIFFERENCE},
-    ("Pose", 6): {"plane_counts": np.zeros((2, 2))},
+    ("Pose", 6): {},  # counts of planes, in whose place `plane_offsets` is since version 11
     ("Pose", 7): {"confirmations": 0},
     ("Pose", 8): {"jumps": 0, "usual_accelerations": np.zeros(3)},
     ("Pose", 9): {"scale_difference": 0.0},
+    ("Pose", 10): {"plane_offsets": np.zeros(3)},
     ("Tracks", 1): {"repeated": 0.0},
     ("Map", 5): {"loop_closed": 0},
     ("Building", 1): {"doubts": np.zeros((0, 3))},
@@ -214,7 +215,7 @@ def _set_field(message: Any, name: str, value: Any) -> None:
         return
     found = getattr(message, name)
     found.dtype, found.encoding, found.data = value.dtype.str.lstrip("<"), "raw", value.tobytes()
-    found.shape.extend(value.shape)
+    found.shape[:] = value.shape
 
 
 def _empty_layout(columns: Columns) -> str:

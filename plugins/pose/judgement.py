@@ -5,8 +5,8 @@ status, with its figures:
 
 - **Information**: landmarks of the map determine all six directions, and there are enough of them.
 - **Agreement**: more matches agree with the pose than would by chance.
-- **Contradiction**: what disagrees is not explained by something that moves (`dynamic_objects.py` asks static matches, and planes), of late no more
-  points and planes disagreed than usual, planes turn as the camera does (`contradiction.py`), and the residuals so far do not contradict the
+- **Contradiction**: what disagrees is not explained by something that moves (`dynamic_objects.py` asks static matches, and planes), of late most
+  points agreed, planes lie and turn as they should (`contradiction.py`), and the residuals so far do not contradict the
   camera's calibration (`calibration_uncertainty.py`). A frame that comes after a contradiction, and that the map does not support, is lost.
 - **Continuity**: the rotation was measured, and the frame continues the previous one, or the map knows its details: of a place that is built alike,
   walls and lines agree, and points do not. A jump from a predicted rotation is verified by the map alone. The place where a camera is found again, or
@@ -35,7 +35,7 @@ from trihedron.plugins.mapping.submaps import is_elsewhere
 from trihedron.plugins.pose.calibration_uncertainty import contradicted_calibration
 from trihedron.plugins.pose.dynamic_objects import MovingOptions, Selection, status_with_static
 from trihedron.plugins.pose.map_alignment import InlierStatistics, MapAlignment, TrackingStatus
-from trihedron.plugins.shared.contradiction import contradicting_depth, contradiction_so_far, disagreement, plane_counts
+from trihedron.plugins.shared.contradiction import contradicting_depth, contradiction_so_far, disagreement
 from trihedron.plugins.shared.pose_optimizer import PoseSolution
 from trihedron.plugins.shared.residuals_kernels import NEAR_M
 
@@ -146,12 +146,12 @@ def judge_by_run(pose: Pose, planes_agree: bool) -> Pose:
 
 
 def with_disagreement(pose: Pose, previous: Pose, inliers: InlierStatistics, static: Selection | None) -> Pose:
-    """Give a pose the averages of the previous one, updated by the matched points and planes of this frame that disagree. Few matched points leave
-    theirs as it is, and so does a pose by planes alone, for which all points may be what moves."""
-    (points, _, planes), (matched_points, _, matched_planes) = inliers.inliers, inliers.matched
+    """Give a pose the average of the previous one, updated by the matched points of this frame that disagree. Few leave it as it is, and so does a
+    pose by planes alone, for which all points may be what moves."""
+    points, matched_points = inliers.inliers[0], inliers.matched[0]
     counted = matched_points >= DETAILED and static is not Selection.PLANES
     average = disagreement(previous, matched_points, points) if counted else previous.disagreement
-    return replace(pose, disagreement=average, plane_counts=plane_counts(previous, matched_planes, planes))
+    return replace(pose, disagreement=average)
 
 
 def since_loss(pose: Pose, previous: Pose) -> Pose:

@@ -47,6 +47,7 @@ from trihedron.plugins.pose.map_alignment import MapAlignment
 from trihedron.plugins.pose.world_uncertainty import in_world, keyframe_covariance, propagate_world_covariance
 from trihedron.plugins.shared.contradiction import with_averages_of
 from trihedron.plugins.shared.distance_scale import with_scale_difference
+from trihedron.plugins.shared.plane_offsets import with_plane_offsets
 from trihedron.plugins.shared.plane_turns import with_turn_difference
 from trihedron.plugins.shared.pose_optimizer import PoseSolution
 
@@ -120,7 +121,9 @@ class Refine(JudgementOptions):
             return self._lost(start, reason, rotation, previous, map, submap)
         pose = in_world(pose, previous, solution, problem)
         pose = with_disagreement(with_turn_difference(pose, previous, tracks, planes), previous, inliers, static)
-        pose = with_scale_difference(pose, previous, problem.terms(T)[0].positions_m, keypoints.points_m[matches.keypoints[:, 0]])
+        points_known, _, planes_known = problem.terms(T)
+        pose = with_scale_difference(pose, previous, points_known.positions_m, keypoints.points_m[matches.keypoints[:, 0]])
+        pose = with_plane_offsets(pose, previous, planes_known.coefficients[: len(matches.planes)], planes, matches.planes[:, 0])
         pose = with_missing_points(since_loss(pose, previous), previous, problem)
         return judge_by_run(pose, not inliers.most_planes_disagree)
 

@@ -347,15 +347,15 @@ def test_a_value_of_an_older_version_names_the_version_and_the_fields():
     message.version = 1
     later = {*LEARNED, "disagreement", "submap", "unrecognised", "map_covariance", "noise_scale", "repeats", "sensitivity", "twist"}
     later |= {"reference_twist", "keyframe_covariance", "lost_from", "missing", "depth_scale_sigma", "turn_difference", "usual_turn_difference"}
-    later |= {"plane_counts"}
+    later |= {"plane_offsets"}
     kept = [array for array in message.arrays if array.name not in later]
     del message.arrays[:]
     message.arrays.extend([*kept, type(kept[0])(name="quality", dtype="float", encoding="raw", data=bytes(8))])
     assert refusal(message) == (
-        "a.mcap: topic /keypoints: holds Pose version 1, this program reads version 10, with the field 'calibration_information', "
+        "a.mcap: topic /keypoints: holds Pose version 1, this program reads version 11, with the field 'calibration_information', "
         "'calibration_score', 'confirmations', 'depth_scale_sigma', 'disagreement', 'jumps', 'keyframe_covariance', 'lost_from', 'map_covariance', "
         "'missing', "
-        "'noise_scale', 'plane_counts', 'reference_twist', "
+        "'noise_scale', 'plane_offsets', 'reference_twist', "
         "'repeats', 'scale_difference', 'sensitivity', 'submap', 'turn_difference', 'twist', 'unrecognised', "
         "'usual_accelerations', 'usual_turn_difference' "
         "that it lacks, "

@@ -1,52 +1,80 @@
-"""Planes that disagree with the pose more than usual are a contradiction, and a contradicted pose is not continued without the map."""
-
-import dataclasses
+"""Planes that lie elsewhere than in the map, by more than usual, are a contradiction."""
 
 import numpy as np
 import pytest
 
-from trihedron.pipeline.core.types import Pose
+from trihedron.pipeline.core.types import Planes, Pose
 from trihedron.plugins.pose.judgement import judge_by_run
-from trihedron.plugins.shared.contradiction import contradiction_so_far, plane_counts
+from trihedron.plugins.shared.contradiction import contradiction_so_far
+from trihedron.plugins.shared.plane_offsets import plane_offset, with_plane_offsets
 
 FIRST = Pose(0, 0, np.eye(4), np.eye(6), np.eye(4), -1, np.zeros(3, np.int32), 0, "ok", "")
+WALLS = np.array([[0.0, 0.0, -1.0, 2.0], [0.0, 0.0, -1.0, 4.0]])  # 2 m and 4 m away, frontal
 
 
-def followed(pose, frames, agreed, matched=10):
-    """The poses of so many frames, in each of which so many planes are matched, and so many of them agree."""
-    poses = [pose]
+def planes_of(pixels=(2400, 2400)):
+    """The two walls, each with so many of the 4800 pixels; one point less of the second."""
+    samples = np.zeros((2, 8, 3), np.float32)
+    samples[:, :, 2] = WALLS[:, 3:]
+    samples[1, 7] = np.nan
+    labels = np.zeros((60, 80), np.uint8)
+    return Planes(0, 0, WALLS, np.tile(np.eye(3), (2, 1, 1)), np.tile(np.eye(4), (2, 1, 1)), np.array(pixels, np.int32), samples, labels, 1)
+
+
+def followed(pose, frames, off, share=1.0):
+    """The poses of so many frames, in each of which the planes are off by this share of their distance."""
+    planes, poses = planes_of((int(2400 * share), int(2400 * share))), [pose]
+    known = WALLS * [1.0, 1.0, 1.0, 1.0 + off]
     for _ in range(frames):
-        poses.append(dataclasses.replace(poses[-1], plane_counts=plane_counts(poses[-1], matched, agreed)))
+        poses.append(with_plane_offsets(poses[-1], poses[-1], known, planes, np.arange(2)))
     return poses[1:]
 
 
-def test_planes_that_disagree_more_than_usual_are_a_contradiction():
-    """Nine of ten planes agree for forty frames, and one of ten from then on: seen within nine frames, and over with them."""
-    clean = followed(FIRST, 40, 9)
-    frozen = followed(clean[-1], 20, 1)
-    after = followed(frozen[-1], 20, 9)
+def test_the_offset_is_that_of_half_of_the_area():
+    """The first wall is 2 cm off at 2 m, the second 12 cm at 4 m."""
+    known, both = WALLS + np.array([[0.0, 0.0, 0.0, 0.02], [0.0, 0.0, 0.0, 0.12]]), np.arange(2)
+    assert plane_offset(known, planes_of((2400, 1200)), both) == pytest.approx((0.01, 0.75), abs=1e-6)
+    assert plane_offset(known, planes_of((1200, 2400)), both) == pytest.approx((0.03, 0.75), abs=1e-6)
+    assert plane_offset(known[1:], planes_of(), both[1:]) == pytest.approx((0.03, 0.5), abs=1e-6)
+    assert plane_offset(known[:0], planes_of(), both[:0]) == (0.0, 0.0)
+
+
+def test_planes_that_lie_elsewhere_than_usual_are_a_contradiction():
+    """Half a per cent off for forty frames, and five from then on: seen in the third, and over with them."""
+    clean = followed(FIRST, 40, 0.005)
+    frozen = followed(clean[-1], 20, 0.05)
+    after = followed(frozen[-1], 40, 0.005)
     assert not any(map(contradiction_so_far, clean))
-    assert not any(map(contradiction_so_far, frozen[:3])) and all(map(contradiction_so_far, frozen[8:]))
-    assert not any(map(contradiction_so_far, after[2:]))
+    assert not any(map(contradiction_so_far, frozen[:2])) and all(map(contradiction_so_far, frozen[3:]))
+    assert not any(map(contradiction_so_far, after[20:]))
     judged = judge_by_run(frozen[8], planes_agree=False)
     assert judged.status == "degraded"
-    assert judged.reason == "colour and depth contradict each other: of late 70 % of the planes disagree with the points, usually 30 %"
+    assert judged.reason == (
+        "colour, depth and map contradict each other: of late planes lie 3.3 % of their distance from where the map has them, usually 0.6 %"
+    )
 
 
-@pytest.mark.parametrize("matched, agreed", [(10, 1), (3, 0), (12, 12), (0, 0)])
-def test_what_is_usual_is_none(matched, agreed):
-    """A miscalibrated camera, of whose planes hardly any agree for a whole run."""
-    assert not any(map(contradiction_so_far, followed(FIRST, 100, agreed, matched)))
+@pytest.mark.parametrize("off", [0.0, 0.002, 0.05])
+def test_what_is_usual_is_none(off):
+    """Planes that are off by as much for a whole run, those of a miscalibrated camera among them."""
+    assert not any(map(contradiction_so_far, followed(FIRST, 100, off)))
+
+
+def test_what_is_less_than_half_a_per_cent_is_none():
+    """Depth without errors, after which planes are off by half a per cent."""
+    assert not any(map(contradiction_so_far, followed(followed(FIRST, 40, 0.0)[-1], 100, 0.005)))
 
 
 def test_a_change_for_good_becomes_usual():
-    """One of ten planes agrees from a frame on, for a hundred frames."""
-    changed = followed(followed(FIRST, 40, 9)[-1], 100, 1)
-    assert all(map(contradiction_so_far, changed[8:50])) and not any(map(contradiction_so_far, changed[90:]))
+    """Five per cent off from a frame on, after half a per cent: for three seconds at 30 images a second it is a contradiction."""
+    changed = followed(followed(FIRST, 40, 0.005)[-1], 120, 0.05)
+    assert all(map(contradiction_so_far, changed[3:90])) and not any(map(contradiction_so_far, changed[105:]))
 
 
-def test_frames_with_few_planes_are_not_counted():
-    """Of five planes four are matched wrongly, the same for sixty frames, after forty with ten that agree."""
-    clean = followed(FIRST, 40, 10)[-1]
-    few = followed(clean, 60, 1, matched=5)
-    assert not any(map(contradiction_so_far, few)) and np.array_equal(few[-1].plane_counts, clean.plane_counts)
+def test_planes_count_by_their_area():
+    """Walls in a hundredth of the image, off by five per cent for ten frames, hardly count; frames without any leave all as it is."""
+    clean = followed(FIRST, 40, 0.005)[-1]
+    few = followed(clean, 10, 0.05, share=0.01)
+    assert not any(map(contradiction_so_far, few)) and few[-1].plane_offsets[0] < 0.006
+    none = with_plane_offsets(clean, clean, WALLS[:0], planes_of(), np.arange(0))
+    assert np.array_equal(none.plane_offsets, clean.plane_offsets)

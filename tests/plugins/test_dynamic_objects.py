@@ -255,11 +255,11 @@ def test_what_contradicts_is_not_continued_without_the_map(world, map):
     few = dataclasses.replace(matches, **{kind: getattr(matches, kind)[:1] for kind in kinds})
     before = pose_of(camera_at(STEP - 1), STEP - 1)
     lost, continued = (
-        Refine()(world.frame(STEP).camera, *start, None, few, *features, dataclasses.replace(before, plane_counts=counts), map, None)
-        for counts in (np.array([[45.0, 60.0], [60.0, 600.0]]), np.array([[10.0, 60.0], [60.0, 600.0]]))
+        Refine()(world.frame(STEP).camera, *start, None, few, *features, dataclasses.replace(before, plane_offsets=offsets), map, None)
+        for offsets in (np.array([0.02, 0.005, 60.0]), np.array([0.006, 0.005, 60.0]))
     )
-    reason = "colour and depth contradict each other: of late 75 % of the planes disagree with the points, usually 10 %; and now "
-    assert (lost.status, lost.reason) == ("lost", reason + "only 3 of 3 matches with the map agree") and lost.plane_counts[0, 0] == 45.0
+    doubt = "colour, depth and map contradict each other: of late planes lie 2.0 % of their distance from where the map has them, usually 0.5 %"
+    assert (lost.status, lost.reason) == ("lost", f"{doubt}; and now only 3 of 3 matches with the map agree") and lost.plane_offsets[0] == 0.02
     assert continued.status == "degraded"
 
 

@@ -49,7 +49,7 @@ def test_nothing_is_returned_when_nothing_changes():
     assert step(Covisibility(), world, map, 9, at=20, repeats=1, **seen) is None  # an image that repeats the one before
     assert step(Covisibility(), world, map, 9, at=20, scale_difference=0.02, **seen) is None  # depth has another scale than the map
     assert step(Covisibility(), world, map, 9, at=20, turn_difference=np.deg2rad([0.0, 0.3, 0.0]), **seen) is None  # planes turned otherwise
-    assert step(Covisibility(), world, map, 9, at=20, plane_counts=np.array([[50.0, 60], [60, 600]]), **seen) is None  # most planes disagree
+    assert step(Covisibility(), world, map, 9, at=20, plane_offsets=np.array([0.02, 0.005, 60]), **seen) is None  # planes lie elsewhere
     assert NoMap()(pose_of(np.eye(4), 0)) is None
 
 
