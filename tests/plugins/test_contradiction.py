@@ -1,5 +1,7 @@
 """Planes that lie elsewhere than in the map, by more than usual, are a contradiction."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -36,6 +38,10 @@ def test_the_offset_is_that_of_half_of_the_area():
     assert plane_offset(known, planes_of((2400, 1200)), both) == pytest.approx((0.01, 0.75), abs=1e-6)
     assert plane_offset(known, planes_of((1200, 2400)), both) == pytest.approx((0.03, 0.75), abs=1e-6)
     assert plane_offset(known[1:], planes_of(), both[1:]) == pytest.approx((0.03, 0.5), abs=1e-6)
+    samples = planes_of().samples_m.copy()
+    samples[0, :4], samples[1] = 0.0, [1.0, np.inf, 4.0]  # no points
+    strange = dataclasses.replace(planes_of(), samples_m=samples)
+    assert plane_offset(known, strange, both) == pytest.approx((0.01, 0.5), abs=1e-6)
     assert plane_offset(known[:0], planes_of(), both[:0]) == (0.0, 0.0)
 
 
