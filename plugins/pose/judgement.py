@@ -3,7 +3,8 @@
 A pose is not trusted because an optimiser converged. Five tests look for reasons to doubt it; the first that finds one gives the reason of the
 status, with its figures:
 
-- **Information**: landmarks of the map determine all six directions, and there are enough of them.
+- **Information**: landmarks of the map determine all six directions, and there are enough of them; where there is hardly a point or line, planes that
+  agree do.
 - **Agreement**: more matches agree with the pose than would by chance.
 - **Contradiction**: what disagrees is not explained by something that moves (`dynamic_objects.py` asks static matches, and planes), of late most
   points agreed, planes lie and turn as they should (`contradiction.py`), and the residuals so far do not contradict the
@@ -242,6 +243,8 @@ def _by_information(options: JudgementOptions, evidence: Evidence) -> TrackingSt
         status, reason = DEGRADED, f"only {points} points, {lines} lines and {planes} planes of the map were found"
     elif inliers.total < options.min_share * inliers.matches:
         status, reason = DEGRADED, f"only {inliers.total} of {inliers.matches} matches with the map agree"
+    elif solution.disputed and points + 2 * lines < options.min_inliers:
+        status, reason = DEGRADED, f"planes alone observe {solution.disputed} directions of motion, and disagree with the map"
     elif evidence.rotation.source == "prediction":
         status, reason = DEGRADED, "the rotation was predicted, not measured, before refinement"
     return TrackingStatus(status, reason)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Protocol
 
@@ -114,8 +114,8 @@ class MapAlignment:
     def classify(self, solution: PoseSolution) -> PoseSolution:
         """Replace the flags of a solution by those of all matches, whatever it was estimated from."""
         T = solution.T_world_camera
-        flags = classify_terms(T, self.camera, *self.terms(T))
-        return PoseSolution(T, solution.covariance, solution.unobservable, *flags, solution.cost)
+        points, lines, planes = classify_terms(T, self.camera, *self.terms(T))
+        return replace(solution, points=points, lines=lines, planes=planes)
 
     def statistics(self, solution: PoseSolution) -> InlierStatistics:
         """Count the inliers of a solution with the flags of all matches."""

@@ -28,7 +28,8 @@ NO_PLANES = PlaneTerms(np.empty(0, np.int32), np.empty((0, 4)), np.empty((0, 3, 
 @dataclass(frozen=True)
 class PoseSolution:
     """Result of `solve_pose`. Covariance (6, 6) and `unobservable`, unit columns (6, u), are in xi = (rho, phi), camera frame; with a fixed rotation
-    (3, 3) and (3, u) of rho alone. Flags are OUTLIER, INLIER or NO_DEPTH (a line of which only the image part fits)."""
+    (3, 3) and (3, u) of rho alone. Flags are OUTLIER, INLIER or NO_DEPTH (a line of which only the image part fits). `disputed` is the number of
+    directions that planes beyond their gates alone observe."""
 
     T_world_camera: F64
     covariance: F64
@@ -37,6 +38,7 @@ class PoseSolution:
     lines: U8
     planes: U8
     cost: float
+    disputed: int = 0
 
 
 def solve_pose(
@@ -56,13 +58,15 @@ def solve_pose(
     Huber weight, where nothing else observes a direction: a bare room has few walls, and rejecting 5 % of them is too much."""
     terms, free = (points, lines, planes), 3 if fixed_rotation else 6
     poses, prior = np.array([T_world_camera, T_prior]), np.array(prior_information, np.float64)
+    unobserved = []  # numbers of directions that terms within their gates do not observe, and those that planes beyond them do not, either
     for slack in (1.0, PLANE_SLACK):
         flags = _all_inliers(terms)
         T, covariance, data, _, cost, complete = solve(poses, prior, camera.intrinsics, *terms, flags, free, ROUNDS, slack)
         unobservable = np.empty((free, 0)) if complete else _unobservable(data, prior[:free, :free])
+        unobserved.append(unobservable.shape[1])
         if not unobservable.shape[1] or flags.planes.all():
             break
-    return PoseSolution(T, covariance, unobservable, *flags, cost)
+    return PoseSolution(T, covariance, unobservable, *flags, cost, max(unobserved[0] - unobserved[-1], 0))
 
 
 def first_step(

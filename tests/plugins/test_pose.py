@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from trihedron.pipeline.core.geometry import invert
-from trihedron.pipeline.core.lie import exp_se3, log_se3, rotation_angle_deg
+from trihedron.pipeline.core.lie import exp_se3, exp_so3, log_se3, rotation_angle_deg
 from trihedron.pipeline.core.types import Pose
 from trihedron.plugins.map.covisibility import Covisibility
 from trihedron.plugins.matches.local_map import LocalMap
@@ -239,6 +239,23 @@ def test_a_jump_that_no_rotation_measured_is_verified_by_the_map_alone():
         ("degraded", "1 directions of motion are unobservable, held at the prediction"),
         ("degraded", "the rotation was predicted, not measured, before refinement"),
     ]
+
+
+@pytest.mark.parametrize("tilt_deg, status", [(0.0, "ok"), (0.65, "degraded")])
+def test_a_pose_by_walls_that_disagree_is_degraded(tilt_deg, status):
+    """Three walls and no point: one of them is turned in the map, and the camera's place along its normal is known by it alone."""
+    world = World(noise=0.0)
+    map, features, guess = first_map(world), world.features(camera_at(5), 5), camera_at(5) @ exp_se3(OFF)
+    rotation, translation = rotation_of(guess, 5, 0.5), translation_of(guess, 5, sigma_m=0.03)
+    found = LocalMap()(world.frame(5).camera, rotation, translation, *features, map, None)
+    none, wall = found.keypoints[:0], found.planes[:1, 1]
+    walls = dataclasses.replace(found, keypoints=none, segments=none, planes=found.planes[:3], parallel=none, perpendicular=none)
+    turned = map.planes.rows("coefficients", wall).copy()
+    turned[0, :3] = exp_so3(np.deg2rad([0.0, tilt_deg, 0.0])) @ turned[0, :3]
+    other = dataclasses.replace(map, planes=map.planes.updated(wall, coefficients=turned))
+    pose = Refine()(world.frame(5).camera, rotation, translation, None, walls, *features, pose_of(camera_at(4), 4), other, None)
+    reason = {"ok": "0 points, 0 lines and 3 planes of the map", "degraded": "planes alone observe 1 directions of motion, and disagree with the map"}
+    assert (pose.status, pose.reason) == (status, reason[status])
 
 
 def test_a_corridor_keeps_the_prediction_along_it():

@@ -230,6 +230,19 @@ def test_one_plane_moves_only_what_it_sees():
     assert np.allclose(held.sum(axis=1), [1, 1, 0, 0, 0, 1], atol=1e-3)
 
 
+@pytest.mark.parametrize("tilt, disputed", [(0.0, 0), (0.011, 1)])
+def test_a_wall_that_disagrees_and_alone_observes_a_direction(tilt, disputed):
+    """Three walls at right angles, known and measured to a milliradian; one is measured at another angle to the others. Without it the position along
+    its normal is that of the prior."""
+    walls, tight = np.concatenate([np.eye(3), np.full((3, 1), 2.0)], axis=1), np.tile(1e-6 * np.eye(3), (3, 1, 1))
+    seen = walls.copy()
+    seen[2, :3] = exp_so3(np.array([tilt, 0.0, 0.0])) @ seen[2, :3]
+    found = solve_pose(
+        np.eye(4), CAMERA, np.eye(4), np.diag(PRIOR_SIGMA**-2), planes=PlaneTerms(np.full(3, SAME, np.int32), walls, tight, seen, tight)
+    )
+    assert found.planes.all() and not found.unobservable.shape[1] and found.disputed == disputed
+
+
 def test_planes_with_the_rotation_known_are_a_linear_problem():
     """`n·t = d_camera - d_world`: the closed form of weighted least squares, prior included."""
     rng = np.random.default_rng(6)
