@@ -52,4 +52,4 @@ def _disagreeing_points(pose: Pose) -> str:
     """Return why matched points have contradicted the map for a while, empty where most of them agree."""
     if pose.disagreement <= MOST_DISAGREEMENT:
         return ""
-    return f"colour, depth and map contradict each other: of late {100.0 * pose.disagreement:.0f} % of the matched points disagree"
+    return f"most points contradict the map: of late {100.0 * pose.disagreement:.0f} % of the matched ones disagree"

@@ -14,7 +14,7 @@ from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import F64, I32, Planes, Pose
 
 LATE, USUAL = 10.0, 100.0  # images full of matched planes that the offset of late, and the usual one, are averaged over
-MOST = 3.0  # times the usual offset
+MOST = 3.5  # times the usual offset; at most 3.4 of 75 simulated sensors, 2.8 of six sequences
 LEAST = 0.002  # of the distance, that is usual at least
 LEARNED = 2.0  # times the usual offset that a frame counts at most in it: a fault of some seconds does not become usual, and a change for good does
 
@@ -51,7 +51,4 @@ def contradicting_offsets(pose: Pose) -> str:
     late, usual, _ = pose.plane_offsets.tolist()
     if late <= MOST * max(usual, LEAST):
         return ""
-    return (
-        "colour, depth and map contradict each other: "
-        f"of late planes lie {100.0 * late:.1f} % of their distance from where the map has them, usually {100.0 * usual:.1f} %"
-    )
+    return f"planes contradict the map: of late they lie {100.0 * late:.1f} % of their distance from where it has them, usually {100.0 * usual:.1f} %"
