@@ -7,13 +7,14 @@ status, with its figures:
   agree do.
 - **Agreement**: more matches agree with the pose than would by chance.
 - **Contradiction**: what disagrees is not explained by something that moves (`dynamic_objects.py` asks static matches, and planes), of late most
-  points agreed, planes lie and turn as they should (`contradiction.py`), and the residuals so far do not contradict the
-  camera's calibration (`calibration_uncertainty.py`). A frame that comes after a contradiction, and that the map does not support, is lost.
+  points agreed, planes lay where the map has them and turned as the camera did, distances were those of the map (`contradiction.py`), and the
+  residuals so far do not contradict the camera's calibration (`calibration_uncertainty.py`). A frame that comes after a contradiction, and that the
+  map does not support, is lost.
 - **Continuity**: the rotation was measured, and the frame continues the previous one, or the map knows its details: of a place that is built alike,
   walls and lines agree, and points do not. A jump from a predicted rotation is verified by the map alone. The place where a camera is found again, or
   where it is after a change of motion that nothing carried makes (`continuity.py`), and which the map alone determines, three frames in a row verify
-  with which their planes agree.
-  It keeps finding what was mapped before it was lost; in a room like the one it was taken to be in, it does until it leaves.
+  with which their planes agree. It keeps finding what was mapped before it was lost; in a room like the one it was taken to be in, it does until it
+  leaves.
 - **Freshness**: an image that repeats the one before, wholly or for the most part, measures nothing, nor does one whose colour repeats it and whose
   depth does not.
 

@@ -58,7 +58,7 @@ def solve_pose(
     Huber weight, where nothing else observes a direction: a bare room has few walls, and rejecting 5 % of them is too much."""
     terms, free = (points, lines, planes), 3 if fixed_rotation else 6
     poses, prior = np.array([T_world_camera, T_prior]), np.array(prior_information, np.float64)
-    unobserved = []  # numbers of directions that terms within their gates do not observe, and those that planes beyond them do not, either
+    unobserved = []  # number of directions that nothing observes, without planes beyond their gates and then with them
     for slack in (1.0, PLANE_SLACK):
         flags = _all_inliers(terms)
         T, covariance, data, _, cost, complete = solve(poses, prior, camera.intrinsics, *terms, flags, free, ROUNDS, slack)

@@ -10,7 +10,7 @@ import pytest
 from trihedron.pipeline.app.cli import main
 from trihedron.pipeline.core.errors import RecordingError
 from trihedron.pipeline.core.registry import load_plugins, plugin_class
-from trihedron.pipeline.core.types import Building
+from trihedron.pipeline.core.types import Building, Pose
 from trihedron.pipeline.record import upgrade
 from trihedron.pipeline.record.codec import FORMAT, Encoder, LegacyMessage
 from trihedron.pipeline.record.mcap_file import McapFile
@@ -175,6 +175,26 @@ def test_a_value_without_a_later_field_is_upgraded(tmp_path, topic, of, older, l
     assert main(["convert", str(before), str(after)]) == 0
     expected, upgraded = (list(Recording(path).values(topic)) for path in (recorded, after))
     assert [Encoder().encode(value) for value in upgraded] == [Encoder().encode(value) for value in expected] and len(upgraded) == 3
+
+
+def test_counts_of_planes_make_room_for_their_offsets(tmp_path):
+    """Pose version 10 had an array of another shape in the place of `plane_offsets`."""
+    recorded, before, after = (tmp_path / f"{name}.mcap" for name in ("recorded", "before", "after"))
+    writer = RecordingWriter(recorded, {})
+    writer.write("pose", Pose(0, 0, np.eye(4), np.eye(6), np.eye(4), -1, np.zeros(3, np.int32), 0, "ok", "", confirmations=2))
+    writer.close()
+    rewrite(recorded, before, with_counts_of_planes)
+    assert main(["convert", str(before), str(after)]) == 0
+    expected, upgraded = (next(Recording(path).values("pose")) for path in (recorded, after))
+    assert Encoder().encode(upgraded) == Encoder().encode(expected) and upgraded.confirmations == 2
+
+
+def with_counts_of_planes(data):
+    """A pose of version 10, with two rows of two counts."""
+    message = message_class("Pose").FromString(data)
+    message.version = 10
+    message.plane_offsets.shape[:], message.plane_offsets.data = [2, 2], np.array([[1.0, 2.0], [3.0, 4.0]]).tobytes()
+    return message.SerializeToString()
 
 
 def without(field, data):
