@@ -24,10 +24,9 @@ LAYOUT = "give the folder that holds frame-000000.color.png or .jpg, .depth.png 
 class SevenScenes(SequenceReader):
     """Folder with frame-000000.color.png or .jpg, .depth.png (mm) and .pose.txt (camera to world) (Shotton et al. 2013). Frames are 1/30 s apart.
 
-    The published depth is *not* registered to colour: the two cameras are a few centimetres apart, and no calibration of the pair was
-    published. It is read as if both were one camera, of focal length 585 and centre (320, 240), as its authors do; along the edges of
-    things colour and depth then disagree by some pixels, which a run warns of and `trihedron calibrate` estimates. Poses are those of the depth
-    camera; with a `depth_camera` in camera.yaml they become those of the colour camera."""
+    The published depth is *not* registered to colour: it is a camera of its own, of focal length 585 and centre (320, 240), and no calibration of the
+    pair was published. Colour is taken to be that of a usual Kinect (focal length 525, 25 mm to the right), to which depth is registered, with
+    `sigmas` as single Kinects differ; a camera.yaml replaces both. The published poses are those of the depth camera, and become those of colour."""
 
     camera: str = ""  # preset or camera.yaml; empty = the folder's file, else the data set's camera
 

@@ -141,6 +141,15 @@ def test_what_is_asked_for_goes_before_the_file_and_the_file_before_the_name(tmp
     assert choose_calibration(tmp_path, "", default="icl_nuim") is PRESETS["icl_nuim"]
 
 
+def test_single_kinects_differ_from_a_usual_one_as_its_sigmas_state() -> None:
+    cameras = [PRESETS[name].camera for name in ("tum_fr1", "tum_fr2", "tum_fr3")]
+    focal = [f / 525.0 - 1.0 for camera in cameras for f in (camera.fx, camera.fy)]
+    centre = [x / 640.0 for camera in cameras for x in (camera.cx - 320.0, camera.cy - 240.0)]
+    spread = [round(float(np.sqrt(np.mean(np.square(errors)))), 3) for errors in (focal, centre)]
+    usual = PRESETS["seven_scenes"].camera.sigmas
+    assert [usual.focal, usual.centre] == [usual.depth_focal, usual.registration] == spread
+
+
 def test_a_camera_that_is_neither_file_nor_preset_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(DataError) as caught:
         choose_calibration(tmp_path, "tum_fr4")

@@ -17,6 +17,7 @@ from trihedron.datasets.readers.tamu import Tamu
 from trihedron.datasets.simulation.synthetic import Synthetic
 from trihedron.pipeline.app.cli import main
 from trihedron.pipeline.core.errors import DataError
+from trihedron.pipeline.core.geometry import pose_matrix
 from trihedron.pipeline.core.lie import exp_se3
 from trihedron.pipeline.core.types import EXACT_DEPTH, F64, DepthNoise
 from trihedron.tools.convert import layout_of
@@ -49,11 +50,14 @@ def test_seven_scenes(seven_scenes: Path) -> None:
     frame = dataset(0)
     assert len(dataset) == 3 and frame is not None and (frame.index, frame.stamp_ns) == (1, 33_333_333)
     assert (frame.color == [200, 100, 10]).all()
-    assert (frame.depth_m[:, :200] == 0).all() and np.allclose(frame.depth_m[:, 200:], 1.501)
-    assert (frame.camera.fx, frame.camera.fy, frame.camera.cx, frame.camera.cy) == (585.0, 585.0, 320.0, 240.0)
+    assert (frame.camera.fx, frame.camera.fy, frame.camera.cx, frame.camera.cy) == (525.0, 525.0, 320.0, 240.0)
+    left, right = (round(320.0 + 525.0 * ((x - 320.0) / 585.0 - 0.025 / 1.501)) for x in (200, 640))  # of what depth shows, seen by colour
+    assert (frame.depth_m[:, : left - 1] == 0).all() and (frame.depth_m[:, right + 1 :] == 0).all()
+    assert np.allclose(frame.depth_m[30:-30, left + 1 : right - 1], 1.501)
     truth = dataset.truth()
     assert truth is not None and truth.stamps_ns.tolist() == [0, 33_333_333, 100_000_000]
-    np.testing.assert_allclose(truth.poses, [POSES[k] for k in (0, 1, 3)], atol=1e-6)
+    T_depth_color = pose_matrix(np.eye(3), np.array([0.025, 0.0, 0.0]))
+    np.testing.assert_allclose(truth.poses, [POSES[k] @ T_depth_color for k in (0, 1, 3)], atol=1e-6)
     assert layout_of(seven_scenes) == "seven_scenes"
 
 
