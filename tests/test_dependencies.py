@@ -156,7 +156,7 @@ def test_modules_belong_to_the_distributions_that_install_them():
     installed = {module: {str(canonicalize_name(name)) for name in names} for module, names in packages_distributions().items()}
     modules = {one.module for one in [*third_party(PROGRAM), *third_party(BESIDE)]} | {"hydra_plugins.hydra_submitit_launcher"}
     known = [module for module in modules if module.split(".")[0] in installed]
-    assert len(known) > 50
+    assert len(known) > (50 if sys.version_info >= (3, 11) else 30)  # Python 3.10 knows only those that list their modules
     assert [module for module in known if distribution_of(module) not in installed[module.split(".")[0]]] == []
 
 

@@ -175,7 +175,8 @@ def _removed_without_frames(runner: Runner, before: FolderBefore) -> Iterator[No
             before.restore()
         if isinstance(error, KeyboardInterrupt):
             left = f"{out} is removed" if before.missing else f"{out} was there before and is kept"
-            error.add_note(f"frames done: {count}, kept in {out}" if count else f"nothing was computed{', and' if before.missing else ';'} {left}")
+            note = f"frames done: {count}, kept in {out}" if count else f"nothing was computed{', and' if before.missing else ';'} {left}"
+            error.__notes__ = [*getattr(error, "__notes__", []), note]  # as `add_note` does, which Python 3.10 has not
         raise
 
 
