@@ -55,7 +55,7 @@ def test_planes_that_lie_elsewhere_than_usual_are_a_contradiction():
     assert not any(map(contradiction_so_far, after[20:]))
     judged = judge_by_run(frozen[8], planes_agree=False)
     assert judged.status == "degraded"
-    assert judged.reason == ("planes contradict the map: of late they lie 3.3 % of their distance from where it has them, usually 0.6 %")
+    assert judged.reason == "planes contradict the map: of late they lie 3.3 % of their distance from where it has them, usually 0.6 %"
 
 
 @pytest.mark.parametrize("off", [0.0, 0.002, 0.05])
