@@ -50,9 +50,13 @@ BUILDING, LIVE = (*ROOM, "outputs=[trajectory,building]"), (*ROOM, "live=true")
 AGAIN = ("replay={folder}/1/run.mcap", "only=[surface]", "outputs=[trajectory,surface]")  # of the second run of a process
 WHEEL = (ALL[0], (POINTS, ROOM, AGAIN, BUILDING, LIVE, *ALL[1][1:]))  # and for a wheel: also buildings and replays
 PARTS = {"tracking": TRACKING, "all": ALL, "wheel": WHEEL}
-FUNCTIONS = {"tracking": 815, "all": 955, "wheel": 1030}  # compiled by both processes, about
-LATER = "of surfaces, loops, a loss and relocalisation"  # what `all` compiles after `tracking`
-NAMES = {"tracking": "of tracking", "all": f"of tracking, {LATER.removeprefix('of ')}", "wheel": "of all that a wheel brings"}
+FUNCTIONS = {"tracking": 815, "all": 955, "later": 315, "wheel": 1030}  # compiled by both processes, about; numba's own by each process anew
+NAMES = {
+    "tracking": "of tracking",
+    "all": "of tracking, surfaces, loops, a loss and relocalisation",
+    "later": "of surfaces, loops, a loss and relocalisation",  # what `all` compiles after `tracking`
+    "wheel": "of all that a wheel brings",
+}
 SHORT = 150  # frames of a run that hardly closes a loop
 STAGES = {"keypoints", "lines", "planes", "manhattan"}  # of the graphs that these runs compile most of
 SWITCH = "TRIHEDRON_COMPILE"  # environment variable: with 0 a run compiles what it calls and nothing beforehand
@@ -64,8 +68,8 @@ def compile_kernels(what: str = "all") -> float:
     """Compile the default graph's kernels, `tracking` or `all` of them, with progress on standard error; returns seconds.
 
     Raises TrihedronError where a process fails."""
-    there = FUNCTIONS["tracking"] if what == "all" and marker("tracking").exists() else 0
-    seconds = _compile(what, Progress(LATER if there else NAMES[what], FUNCTIONS[what] - there))
+    shown = "later" if what == "all" and marker("tracking").exists() else what
+    seconds = _compile(what, Progress(NAMES[shown], FUNCTIONS[shown]))
     marker(what).parent.mkdir(parents=True, exist_ok=True)
     marker(what).touch()
     return seconds

@@ -20,6 +20,7 @@ from typing import Any
 import cv2
 from threadpoolctl import threadpool_limits
 
+from trihedron.pipeline.run.interpreter_stack import call_with_room
 from trihedron.pipeline.run.kept_values import KeptValues
 from trihedron.pipeline.run.node import Node, NodeFailure, NoMoreFrames, consumers_of, lagging_nodes
 from trihedron.pipeline.run.readiness import Readiness, Task
@@ -78,7 +79,7 @@ class Scheduler:
         """Yield (position, values by node) for 0..count-1 in order, fewer where a node raises NoMoreFrames. After a failure the frames before it
         come, then the finished values of that frame, then NodeFailure is raised."""
         lanes = [Lane.prompt] * self._threads + [lane for lane in (Lane.lagging, Lane.waiting) if lane in self._lanes.values()]
-        workers = [threading.Thread(target=self._work, args=(lane,), name=f"stage-{i}", daemon=True) for i, lane in enumerate(lanes)]
+        workers = [threading.Thread(target=call_with_room, args=(self._work, lane), name=f"stage-{i}", daemon=True) for i, lane in enumerate(lanes)]
         for worker in workers:
             worker.start()
         try:

@@ -187,7 +187,7 @@ def test_the_line_says_what_is_compiled(worker, monkeypatch, capsys):
     compilation.compile_kernels()
     printed = capsys.readouterr().err.splitlines()
     assert printed[0] == "compiling functions of surfaces, loops, a loss and relocalisation, for this machine, once ..."
-    assert "1 of about 140 after" in printed[1]
+    assert "1 of about 315 after" in printed[1]
 
 
 def test_all_is_compiled_at_once_where_nothing_was_before(worker, capsys):
