@@ -50,12 +50,13 @@ BUILDING, LIVE = (*ROOM, "outputs=[trajectory,building]"), (*ROOM, "live=true")
 AGAIN = ("replay={folder}/1/run.mcap", "only=[surface]", "outputs=[trajectory,surface]")  # of the second run of a process
 WHEEL = (ALL[0], (POINTS, ROOM, AGAIN, BUILDING, LIVE, *ALL[1][1:]))  # and for a wheel: also buildings and replays
 PARTS = {"tracking": TRACKING, "all": ALL, "wheel": WHEEL}
-FUNCTIONS = {"tracking": 815, "all": 955, "later": 315, "wheel": 1030}  # compiled by both processes, about; numba's own by each process anew
-NAMES = {
-    "tracking": "of tracking",
-    "all": "of tracking, surfaces, loops, a loss and relocalisation",
-    "later": "of surfaces, loops, a loss and relocalisation",  # what `all` compiles after `tracking`
-    "wheel": "of all that a wheel brings",
+LATER = "surfaces, loops, a loss and relocalisation"
+# What the line about compiling names, and how many functions both processes compile, about; numba's own are compiled by each
+SHOWN = {
+    "tracking": ("of tracking", 815),
+    "all": (f"of tracking, {LATER}", 955),
+    "later": (f"of {LATER}", 315),  # what `all` compiles after `tracking`
+    "wheel": ("of all that a wheel brings", 1030),
 }
 SHORT = 150  # frames of a run that hardly closes a loop
 STAGES = {"keypoints", "lines", "planes", "manhattan"}  # of the graphs that these runs compile most of
@@ -69,7 +70,7 @@ def compile_kernels(what: str = "all") -> float:
 
     Raises TrihedronError where a process fails."""
     shown = "later" if what == "all" and marker("tracking").exists() else what
-    seconds = _compile(what, Progress(NAMES[shown], FUNCTIONS[shown]))
+    seconds = _compile(what, Progress(*SHOWN[shown]))
     marker(what).parent.mkdir(parents=True, exist_ok=True)
     marker(what).touch()
     return seconds
@@ -119,9 +120,7 @@ def compile_once(stages: Sequence[str], frames: int | None) -> None:
 def compile_for_wheel(out: Path) -> float:
     """Compile what a wheel carries, for the baseline of `core.machine_code`, and write its archive; returns seconds. Raises TrihedronError."""
     with tempfile.TemporaryDirectory() as folder:
-        seconds = _compile(
-            "wheel", Progress(NAMES["wheel"], FUNCTIONS["wheel"]), NUMBA_CPU_NAME=BASELINE, NUMBA_CPU_FEATURES="", NUMBA_CACHE_DIR=folder
-        )
+        seconds = _compile("wheel", Progress(*SHOWN["wheel"]), NUMBA_CPU_NAME=BASELINE, NUMBA_CPU_FEATURES="", NUMBA_CACHE_DIR=folder)
         pack(Path(folder) / cache_folder().name, out)
     return seconds
 

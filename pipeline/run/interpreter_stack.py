@@ -13,9 +13,9 @@ SLOTS = 2**17  # of 8 bytes: CPython maps 2 MB for such a frame, of which 1 MB s
 def call_with_room(function: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> R:
     """Call a function from a frame that reserves SLOTS of the interpreter's stack, and return its result.
 
-    CPython keeps frames in chunks of 16 KB. Until 2026 it maps the next chunk for each call at the end of one and unmaps it on return, however often
-    that is (https://github.com/python/cpython/issues/142183), and numba's compiler calls 40 to 160 functions deep. The chunk for a large frame is
-    large, so all calls within have room. What is reserved is never touched, so takes no memory."""
+    CPython keeps frames in chunks of 16 KB. Releases before March 2026 map the next chunk for each call at the end of one, and unmap it on return,
+    however often that is (https://github.com/python/cpython/issues/142183), and numba's compiler calls 40 to 160 functions deep. The chunk of a
+    large frame is large, so all calls within have room. What is reserved is never touched, so takes no memory."""
     return function(*args, **kwargs)
 
 
