@@ -95,14 +95,14 @@ $(LOCKER)/bin/uv: $(LOCKER)/created $(LOCK)
 
 # Build tools first: packages without wheels, and this one, are built with the locked ones.
 $(VENV)/installed: $(VENV)/created pyproject.toml $(LOCK)
-	@echo "Installing into $(VENV) (about 1.5 GB to download the first time)"
+	@echo "Installing into $(VENV) (about 1 GB to download the first time)"
 	$(PIP) --quiet --upgrade pip setuptools
 	$(PIP) --upgrade --upgrade-strategy eager --no-build-isolation -e ".[dev]"
 	@touch $(VENV)/base $@
 
 # Without the bytecode of all that is never imported: the first run makes that of the rest.
 $(VENV)/base: $(VENV)/created pyproject.toml $(LOCK)
-	@echo "Installing into $(VENV) (about 700 MB to download the first time)"
+	@echo "Installing into $(VENV) (about 450 MB to download the first time)"
 	$(PIP) --quiet --upgrade pip setuptools
 	$(PIP) --upgrade --upgrade-strategy eager --no-build-isolation --no-compile -e .
 	@touch $@

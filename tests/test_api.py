@@ -157,7 +157,7 @@ def check_conversions(mesh, planes, keypoints, map):
 
 def test_without_open3d_a_conversion_says_how_to_get_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "open3d", None)
-    with pytest.raises(th.TrihedronError, match=r"^open3d: is not installed; install it with: pip install open3d$"):
+    with pytest.raises(th.TrihedronError, match=r"^open3d(-cpu)?: is not installed; install it with: pip install open3d(-cpu)?$"):
         th.Surface.empty(0, 0).to_open3d()
 
 

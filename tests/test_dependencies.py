@@ -102,8 +102,9 @@ def third_party(places: tuple[str, ...]) -> list[Import]:
 
 
 def names_of(requirements: Iterable[str]) -> set[str]:
-    """Canonical names of requirements, without the extras of this project that an extra includes."""
-    return {str(canonicalize_name(Requirement(line).name)) for line in requirements} - {"trihedron"}
+    """Canonical names of what is required on this system, without the extras of this project that an extra includes."""
+    parsed = [Requirement(line) for line in requirements]
+    return {str(canonicalize_name(one.name)) for one in parsed if one.marker is None or one.marker.evaluate()} - {"trihedron"}
 
 
 BASE = names_of(PROJECT["dependencies"])

@@ -158,4 +158,4 @@ def test_wheel_with_the_minimal_requirements(wheel, tmp_path):
     programs = installed(wheel, tmp_path / "env", with_dependencies=False, requirements=ROOT / "requirements-minimal.txt")
     run_five_frames(programs, tmp_path, "outputs=[trajectory,surface]")
     done = subprocess.run([programs / "trihedron", "run", "planes=open3d_ransac"], cwd=tmp_path, capture_output=True, text=True)
-    assert (done.returncode, done.stderr.splitlines()[-1]) == (1, "trihedron: open3d: is not installed; install it with: pip install open3d")
+    assert (done.returncode, done.stderr.splitlines()[-1]) == (1, "trihedron: open3d-cpu: is not installed; install it with: pip install open3d-cpu")

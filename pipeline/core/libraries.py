@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import importlib.metadata
+import platform
 import re
+import sys
 from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -21,6 +23,7 @@ DISTRIBUTIONS = {  # module -> the distribution that holds it, where the names d
     "hydra_plugins.hydra_submitit_launcher": "hydra-submitit-launcher",
     "mcap_protobuf": "mcap-protobuf-support",
     "mcap_ros2": "mcap-ros2-support",
+    "open3d": "open3d-cpu" if (sys.platform, platform.machine()) == ("linux", "x86_64") else "open3d",  # as pyproject.toml declares
     "rerun": "rerun-sdk",
     "yaml": "pyyaml",
 }
@@ -62,10 +65,15 @@ def install_command(module: str) -> str:
 
 
 def declared_requirements() -> dict[str, list[str]]:
-    """Return the distributions that the installed package requires: of its base under "", then of each extra."""
+    """Return the distributions that the installed package requires on this system: of its base under "", then of each extra."""
+    from packaging.requirements import Requirement
+    from packaging.utils import canonicalize_name
+
     found: dict[str, list[str]] = defaultdict(list)
     for line in importlib.metadata.requires("trihedron") or ():
-        name, extra = re.match(r"[\w.-]+", line), re.search(r"""extra == ['"]([\w-]+)['"]""", line)
-        if name and name[0] != "trihedron":  # extras of its own, which another extra includes
-            found[extra[1] if extra else ""].append(name[0].replace("_", "-").lower())
+        requirement, named = Requirement(line), re.search(r"""extra == ['"]([\w-]+)['"]""", line)
+        extra = named[1] if named else ""
+        here = requirement.marker is None or requirement.marker.evaluate({"extra": extra})
+        if here and requirement.name != "trihedron":  # extras of its own, which another extra includes
+            found[extra].append(canonicalize_name(requirement.name))
     return {extra: sorted(names) for extra, names in found.items()}

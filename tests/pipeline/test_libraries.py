@@ -9,17 +9,18 @@ import pytest
 from trihedron.comparison.mesh_files import read_mesh
 from trihedron.pipeline.app.cli import main
 from trihedron.pipeline.core.errors import LibraryError
-from trihedron.pipeline.core.libraries import imports_of, library_error
+from trihedron.pipeline.core.libraries import distribution_of, imports_of, library_error
 from trihedron.pipeline.core.types import Camera
 from trihedron.plugins.shared import libraries
 from trihedron.plugins.shared.pycolmap_pose import absolute_pose
 
+OPEN3D = distribution_of("open3d")  # of the system
 TINY = ["dataset=synthetic", "dataset.width=64", "dataset.height=48", "dataset.length=3"]
 SWEEP = ["-m", *TINY, "outputs=[keypoints]", "keypoints=opencv_orb", "seed=0,1"]
 COMMANDS = {  # module -> words of `trihedron run` that need it, its distribution, what pip is to install
     "distributed": ([*SWEEP, "hydra/launcher=dask", "hydra.launcher.address=tcp://127.0.0.1:9"], "distributed", "'trihedron[cluster]'"),
     "onnxruntime": ([*TINY, "keypoints=onnx", "keypoints.model=a.onnx", "outputs=[keypoints]"], "onnxruntime", "'trihedron[onnx]'"),
-    "open3d": ([*TINY, "planes=open3d_ransac", "outputs=[planes]"], "open3d", "open3d"),
+    "open3d": ([*TINY, "planes=open3d_ransac", "outputs=[planes]"], OPEN3D, OPEN3D),
     "optuna": (["-m", *TINY, "hydra/sweeper=optuna", "lines.tolerance_deg=interval(10,20)", "outputs=[lines]"], "optuna", "'trihedron[search]'"),
     "pyrealsense2": (["dataset=realsense", "outputs=[keypoints]"], "pyrealsense2", "'trihedron[realsense]'"),
     "rerun": ([*TINY, "view=rerun", "outputs=[keypoints]"], "rerun-sdk", "'trihedron[view]'"),
