@@ -1,8 +1,10 @@
 """Recordings as an MCAP reader of other people's sees them: @mcap/core (TypeScript), and the layout for Foxglove that belongs to them."""
 
 import json
+import os
 import re
 import shutil
+import ssl
 import subprocess
 import sys
 import tempfile
@@ -33,9 +35,11 @@ def reader():
     folder = Path(tempfile.gettempdir()) / "trihedron_mcap_reader"
     if not (folder / "installed").exists():
         folder.mkdir(exist_ok=True)
+        authorities = ssl.get_default_verify_paths().cafile  # of the system; npm knows its own alone
+        environment = {**({"NODE_EXTRA_CA_CERTS": authorities} if authorities else {}), **os.environ}
         try:
-            words = ["npm", "install", "--no-audit", "--no-fund", "--silent", "--prefix", str(folder), *PACKAGES]
-            subprocess.run(words, check=True, capture_output=True, timeout=120)
+            words = ["npm", "install", "--no-audit", "--no-fund", "--silent", "--fetch-retries=0", "--prefix", str(folder), *PACKAGES]
+            subprocess.run(words, check=True, capture_output=True, timeout=120, env=environment)
         except (subprocess.CalledProcessError, subprocess.TimeoutExpired):
             pytest.skip("npm cannot install @mcap/core: its registry is not reached")
         (folder / "installed").touch()
