@@ -13,6 +13,7 @@ import trihedron as th
 from trihedron.datasets.simulation.motion import Motion
 from trihedron.datasets.simulation.synthetic import Synthetic
 from trihedron.pipeline.core import types
+from trihedron.pipeline.core.libraries import distribution_of
 from trihedron.pipeline.record import reader
 from trihedron.plugins.keypoints.onnx import KeypointNetwork
 from trihedron.plugins.shared.calibration_error import calibration_covariance
@@ -157,7 +158,8 @@ def check_conversions(mesh, planes, keypoints, map):
 
 def test_without_open3d_a_conversion_says_how_to_get_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "open3d", None)
-    with pytest.raises(th.TrihedronError, match=r"^open3d(-cpu)?: is not installed; install it with: pip install open3d(-cpu)?$"):
+    name = distribution_of("open3d")  # of the system
+    with pytest.raises(th.TrihedronError, match=rf"^{name}: is not installed; install it with: pip install {name}$"):
         th.Surface.empty(0, 0).to_open3d()
 
 

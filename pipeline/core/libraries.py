@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.metadata
 import platform
-import re
 import sys
 from collections import defaultdict
 from collections.abc import Iterator
@@ -69,11 +68,11 @@ def declared_requirements() -> dict[str, list[str]]:
     from packaging.requirements import Requirement
     from packaging.utils import canonicalize_name
 
+    groups = ("", *(importlib.metadata.metadata("trihedron").get_all("Provides-Extra") or ()))
     found: dict[str, list[str]] = defaultdict(list)
-    for line in importlib.metadata.requires("trihedron") or ():
-        requirement, named = Requirement(line), re.search(r"""extra == ['"]([\w-]+)['"]""", line)
-        extra = named[1] if named else ""
-        here = requirement.marker is None or requirement.marker.evaluate({"extra": extra})
-        if here and requirement.name != "trihedron":  # extras of its own, which another extra includes
-            found[extra].append(canonicalize_name(requirement.name))
+    for requirement in map(Requirement, importlib.metadata.requires("trihedron") or ()):
+        marker = requirement.marker
+        group = next((extra for extra in groups if marker is None or marker.evaluate({"extra": extra})), None)
+        if group is not None and requirement.name != "trihedron":  # extras of its own, which another extra includes
+            found[group].append(canonicalize_name(requirement.name))
     return {extra: sorted(names) for extra, names in found.items()}
