@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from typing import Annotated, Any, ClassVar, get_args, get_origin, get_type_hints
 
 import numpy as np
@@ -36,6 +36,12 @@ class ArraySpec:
     dtype: np.dtype[Any]
     shape: Shape
 
+    @cached_property
+    def exact(self) -> tuple[int, ...] | None:
+        """The only shape that fits, None where an axis has any length."""
+        axes = tuple(axis for axis in self.shape.axes if isinstance(axis, int))
+        return axes if len(axes) == len(self.shape.axes) else None
+
 
 @cache
 def array_specs(kind: Any) -> tuple[ArraySpec, ...]:
@@ -59,6 +65,9 @@ def check_arrays(value: Any) -> None:
     lengths: dict[str, int] = {}
     for spec in array_specs(value.__class__):
         array = getattr(value, spec.name)
+        if array.__class__ is np.ndarray and array.dtype is spec.dtype and array.shape == spec.exact:  # nearly all, each some dozens of times a frame
+            array.setflags(write=False)
+            continue
         if not isinstance(array, np.ndarray) or array.dtype != spec.dtype:
             given = getattr(array, "dtype", type(array).__name__)
             raise ValueError(f"{type(value).__name__}.{spec.name}: expected an array of {spec.dtype}, got {given}")

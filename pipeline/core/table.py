@@ -182,7 +182,7 @@ class Table(Described):
     def _check_ids(self, ids: Array) -> Array:
         """Row numbers, after a check. Raises IndexError for one outside 0..size-1."""
         numbers = np.asarray(ids, np.intp)
-        if numbers.size and (numbers.min() < 0 or numbers.max() >= self.size):
+        if numbers.size and numbers.view(np.uintp).max() >= self.size:  # a negative number is a huge one without its sign
             outside = numbers[(numbers < 0) | (numbers >= self.size)][0]
             raise IndexError(f"row {outside} of a table of {self.size}")
         return numbers

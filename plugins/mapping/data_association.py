@@ -76,7 +76,7 @@ def _match_points(
     """Pairs (row, id) and the ids expected in view."""
     *position, descriptors = window.columns(map, POINT, *POINT_COLUMNS, "descriptor")
     visible = visible_points(position, prediction.T_world_camera, camera, options.view_deg, options.octave_scale)
-    ids, descriptors = window.points[visible.rows], descriptors[visible.rows]
+    ids, descriptors = window.points.take(visible.rows), descriptors.take(visible.rows, 0)
     sigma = prediction.sigma_m / np.maximum(visible.depth_m, 0.1)  # of the projection, rad; three standard deviations are searched
     radius = np.minimum(options.radius_px + 3.0 * camera.fx * np.hypot(sigma, prediction.sigma_rad), options.max_radius_px)
     found = _match_visible(options, visible, descriptors, keypoints, radius)

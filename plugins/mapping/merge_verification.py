@@ -55,6 +55,8 @@ def _recent_proposals(map: Map, index: int) -> I32:
 
 def proposed_submaps(map: Map, submap: int, index: int) -> I32:
     """Older sub-maps that one of the last LOOK_FRAMES frames proposed to merge a sub-map with."""
+    if not len(map.proposals):  # in nearly all runs
+        return np.empty(0, np.int32)
     recent = _recent_proposals(map, index)
     recent = recent[index - map.proposals.rows("index", recent) <= LOOK_FRAMES]
     of, older = (map.keyframes.rows("submap", ids) for ids in map.proposals.columns_at(recent, "keyframe", "older_keyframe"))

@@ -32,15 +32,14 @@ REPEATED_FRAMES = 20  # in which the errors of a landmark's residuals repeat: so
 CALIBRATION_SIGMAS = 2.0  # root mean square of the parameters beyond which the calibration is not that of the camera
 
 
-def with_reference_velocity(pose: Pose, previous: Pose, map: Map) -> Pose:
-    """Give a pose the velocity of its reference keyframe: the mean of the motions to it and from it."""
+def reference_velocity(pose: Pose, previous: Pose, map: Map) -> F64:
+    """Return the velocity (6,) of a pose's reference keyframe: the mean of the motions to it and from it; zero without one."""
     if not 0 <= pose.reference < len(map.keyframes):
-        return pose
+        return np.zeros(6)
     if int(map.keyframes.row("index", pose.reference)) == previous.index:
         known = pose.twist.any() and previous.twist.any()
-        return replace(pose, reference_twist=0.5 * (previous.twist + pose.twist) if known else pose.twist)
-    kept = previous.reference_twist if previous.reference == pose.reference else map.keyframes.row("twist", pose.reference)
-    return replace(pose, reference_twist=kept)
+        return 0.5 * (previous.twist + pose.twist) if known else pose.twist
+    return previous.reference_twist if previous.reference == pose.reference else np.asarray(map.keyframes.row("twist", pose.reference))
 
 
 def with_calibration(pose: Pose, previous: Pose, problem: MapAlignment, flags: Flags, keyframes: Keyframes, observed: Observers) -> Pose:

@@ -160,6 +160,8 @@ def since_loss(pose: Pose, previous: Pose) -> Pose:
     """Give a pose the previous one's `lost_from`, `missing` and `confirmations`; the first lost one, and a jump, begin them anew."""
     if pose.jumps or (pose.status == LOST and previous.status != LOST):
         return replace(pose, lost_from=pose.index)
+    if not previous.lost_from:
+        return pose
     return replace(pose, lost_from=previous.lost_from, missing=previous.missing, confirmations=previous.confirmations)
 
 
@@ -169,7 +171,7 @@ def with_missing_points(pose: Pose, previous: Pose, problem: MapAlignment) -> Po
     previous pose."""
     map, visible = problem.map, problem.matches.visible_points
     if not pose.lost_from or pose.submap != previous.submap:
-        return replace(pose, missing=0.0)
+        return replace(pose, missing=0.0) if pose.missing else pose
     old = visible[map.keyframes.rows("index", map.points.rows("first", visible)) < pose.lost_from]
     expected = old[_is_observed(problem, old, pose.T_world_camera)]
     if not len(expected):

@@ -113,8 +113,10 @@ class Refine(JudgementOptions):
         T, held, counts = solution.T_world_camera, solution.unobservable.shape[1], np.array(inliers.inliers, np.int32)
         reference, T_reference_camera = reference_of(map, T, submap)
         stamps = rotation.index, rotation.stamp_ns
-        pose = Pose(*stamps, T, solution.covariance, T_reference_camera, reference, counts, held, status.status, status.reason, submap)
-        pose = replace(pose, repeats=repeats, keyframe_covariance=shared)
+        pose = Pose(
+            *stamps, T, solution.covariance, T_reference_camera, reference, counts, held, status.status, status.reason, submap,
+            repeats=repeats, keyframe_covariance=shared,
+        )  # fmt: skip
         pose = with_motion(pose, previous)
         if pose.jumps and not is_found_again(self, evidence):
             reason = f"the camera jumped, and the map does not determine the pose by itself: only {inliers.total} of {inliers.matches} matches agree"

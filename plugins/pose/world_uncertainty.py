@@ -17,7 +17,7 @@ from trihedron.pipeline.core.kernel import constant
 from trihedron.pipeline.core.lie import adjoint
 from trihedron.pipeline.core.linalg import eigvalsh, matmul
 from trihedron.pipeline.core.types import F64, I32, Map, Pose
-from trihedron.plugins.pose.calibration_uncertainty import carried_calibration, keyframes_seen, with_calibration, with_reference_velocity
+from trihedron.plugins.pose.calibration_uncertainty import carried_calibration, keyframes_seen, reference_velocity, with_calibration
 from trihedron.plugins.pose.map_alignment import MapAlignment
 from trihedron.plugins.pose.world_uncertainty_kernels import scatter_and_drift
 from trihedron.plugins.shared.calibration_error import calibration_covariance
@@ -93,7 +93,7 @@ def in_world(pose: Pose, previous: Pose, solution: PoseSolution, problem: MapAli
     noise_scale = previous.noise_scale
     if not math.isnan(scale):
         noise_scale += (min(scale, SCALE_OUTLIER * noise_scale) - noise_scale) / SCALE_FRAMES
-    moving = with_reference_velocity(replace(pose, noise_scale=noise_scale), previous, problem.map)
+    moving = replace(pose, noise_scale=noise_scale, reference_twist=reference_velocity(pose, previous, problem.map))
     if pose.repeats or pose.jumps:
         carried = _with_world_covariance(carried_calibration(moving, previous), by_drift)
         return _with_unseen_motion(carried, previous) if pose.repeats else carried

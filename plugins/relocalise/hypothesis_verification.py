@@ -69,11 +69,12 @@ def recognise(options: RelocaliseOptions, ways: tuple[Hypotheses, ...], view: Fr
 def _submaps(options: RelocaliseOptions, map: Map, submap: int, lost: bool, index: int, count: int) -> I32:
     """Sub-maps to search: all for a lost camera; now and then the older ones for one tracked in a sub-map that is not merged with the first, and in
     each frame those that a recent proposal would merge it with."""
+    if not lost:
+        proposed = proposed_submaps(map, submap, index)
+        if len(proposed) or submap == 0 or count % options.every:
+            return proposed
     known = np.unique(map.keyframes.rows("submap", living_keyframes(map))).astype(np.int32)
-    if lost:
-        return known
-    proposed = proposed_submaps(map, submap, index)
-    return proposed if len(proposed) else known[known < submap] if count % options.every == 0 else known[:0]
+    return known if lost else known[known < submap]
 
 
 def _accept(options: RelocaliseOptions, place: VerifiedPlace) -> bool:

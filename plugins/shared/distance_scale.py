@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from trihedron.pipeline.core.types import F32, F64, Pose
+from trihedron.plugins.shared.quantiles import quantiles
 
 LEAST_POINTS = 20  # with depth, that distances are measured between
 APART = 2, 3, 5  # each point is paired with those half, a third and a fifth of all points further on
@@ -32,16 +33,16 @@ def scale_difference(known: F64, found: F32) -> float | None:
     """Return the logarithm of the ratio by which at least nine of ten distances between points (n, 3) `found` are larger, or smaller, than between
     the same points where they are `known`; 0.0 where some are larger and some smaller, None for few points. NaN are none. Of all distances the
     longer half is compared, which noise changes least."""
-    finite = np.isfinite(found[:, 2])
-    if np.count_nonzero(finite) < LEAST_POINTS:
+    finite = np.flatnonzero(np.isfinite(found[:, 2]))
+    if len(finite) < LEAST_POINTS:
         return None
-    before, now = _distances(known[finite]), _distances(found[finite].astype(np.float64))
-    longer = np.maximum(before, now)
-    counted = (longer >= np.median(longer)) & (np.minimum(before, now) > TINY_M)
+    before, now = _distances(np.stack([known.take(finite, 0), found.take(finite, 0)]))
+    longer, middle = np.maximum(before, now), len(before) // 2
+    counted = (longer >= np.partition(longer, middle)[middle]) & (np.minimum(before, now) > TINY_M)
     ratios = np.log(now[counted] / before[counted])
     if not len(ratios):
         return None
-    least, most = np.quantile(ratios, [1.0 - MOST, MOST]).tolist()
+    least, most = quantiles(ratios, [1.0 - MOST, MOST]).tolist()
     return float(max(least, 0.0) + min(most, 0.0))
 
 
@@ -55,5 +56,8 @@ def contradicting_scale(pose: Pose) -> str:
 
 
 def _distances(points: F64) -> F64:
-    """Distances (3 n,) of points (n, 3) to those they are paired with."""
-    return np.concatenate([np.linalg.norm(points - np.roll(points, len(points) // share, axis=0), axis=1) for share in APART])
+    """Distances (k, 3 n) of points (k, n, 3) to those they are paired with."""
+    count = points.shape[1]
+    farther = (np.arange(count) - [[count // share] for share in APART]) % count
+    x, y, z = np.moveaxis(points[:, None] - points.take(farther, 1), 3, 0)
+    return np.asarray(np.sqrt(x * x + y * y + z * z).reshape(len(points), -1))

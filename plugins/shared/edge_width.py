@@ -8,9 +8,10 @@ import numpy as np
 
 from trihedron.pipeline.core.types import F64, U8
 from trihedron.plugins.shared.edge_width_kernels import edge_widths
+from trihedron.plugins.shared.quantiles import quantiles
 
 SHARP_PX = 1.2  # median σ of the edges of a camera at rest: optics, colour filter and JPEG make 0.6 to 1.2
-NARROW, MEDIAN_OF_NARROW = 25, 1.35  # percentile of the widths, and the median by it: 1.27 to 1.56 in five sequences of cameras, sharp or blurred
+NARROW, MEDIAN_OF_NARROW = 0.25, 1.35  # quantile of the widths, and the median by it: 1.27 to 1.56 in five sequences of cameras, sharp or blurred
 CONTRAST = 40  # grey levels of an edge
 STRIDE_PX = 8  # between the rows, and the columns, that are looked at
 LEAST_EDGES = 20  # along rows, and along columns, below which nothing is known
@@ -27,5 +28,5 @@ def _variance(widths: F64) -> float:
     """Return the variance (px²) beyond a sharp edge's."""
     if len(widths) < LEAST_EDGES:
         return 0.0
-    median = MEDIAN_OF_NARROW * float(np.percentile(widths, NARROW))
+    median = MEDIAN_OF_NARROW * float(quantiles(widths, NARROW))
     return max(median**2 / (2.0 * np.pi) - SHARP_PX**2, 0.0)

@@ -35,12 +35,13 @@ def plane_offset(known: F64, planes: Planes, matched: I32) -> tuple[float, float
     """Return how far half of the area of the planes `matched` (m,) lies at least from where they are `known` (m, 4), in the camera's frame, as a
     share of its distance; and the area, as a share of the image. Zeros for none."""
     samples, size = planes.samples_m[matched].astype(np.float64), planes.labels.size * planes.stride**2
-    usable = np.isfinite(samples).all(axis=2) & samples.any(axis=2)
+    distances = np.linalg.norm(samples, axis=2)
+    usable = (distances > 0.0) & (distances < np.inf)  # NaN is neither
     plane, counts = np.nonzero(usable)[0], np.count_nonzero(usable, axis=1)
     if not len(plane):
         return 0.0, 0.0
     points, expected, weights = samples[usable], known[plane], (planes.pixels[matched] / np.maximum(counts, 1))[plane]
-    offsets = np.abs((points * expected[:, :3]).sum(axis=1) + expected[:, 3]) / np.linalg.norm(points, axis=1)
+    offsets = np.abs((points * expected[:, :3]).sum(axis=1) + expected[:, 3]) / distances[usable]
     order = np.argsort(offsets)
     area = np.cumsum(weights[order])
     return float(offsets[order][np.searchsorted(area, area[-1] / 2.0)]), min(float(area[-1]) / size, 1.0)

@@ -53,18 +53,19 @@ class StructureGates:
 def tracks_value(now: Features, before: Features, pairs: tuple[I32, I32, I32], R_current_previous: F64) -> Tracks:
     """The pairs of points, lines and planes, rows (previous, current), with the previous geometry."""
     points, lines, planes = pairs
+    of_points, of_lines, of_planes = (kind[:, 0] for kind in pairs)  # `take` gathers rows in a third of the time of an index
     return Tracks(
         index=now.keypoints.index,
         stamp_ns=now.keypoints.stamp_ns,
         previous_index=before.keypoints.index,
         keypoints=points,
-        points_m=before.keypoints.points_m[points[:, 0]],
-        sigma_m=before.keypoints.sigma_m[points[:, 0]],
+        points_m=before.keypoints.points_m.take(of_points, 0),
+        sigma_m=before.keypoints.sigma_m.take(of_points, 0),
         segments=lines,
-        endpoints_m=before.segments.endpoints_m[lines[:, 0]],
+        endpoints_m=before.segments.endpoints_m.take(of_lines, 0),
         planes=planes,
-        coefficients=before.planes.coefficients[planes[:, 0]],
-        plane_covariance=before.planes.covariance[planes[:, 0]],
+        coefficients=before.planes.coefficients.take(of_planes, 0),
+        plane_covariance=before.planes.covariance.take(of_planes, 0),
         R_current_previous=R_current_previous,
         repeated=_repeated(now.keypoints, before.keypoints, points),
     )
@@ -72,10 +73,11 @@ def tracks_value(now: Features, before: Features, pairs: tuple[I32, I32, I32], R
 
 def _repeated(now: Keypoints, before: Keypoints, pairs: I32) -> float:
     """Share of the pairs (n, 2) of key points, rows (previous, current), whose pixel and descriptor are bit-identical."""
-    same = pairs[(before.pixels[pairs[:, 0]] == now.pixels[pairs[:, 1]]).all(axis=1)]
+    x_and_y = before.pixels.take(pairs[:, 0], 0) == now.pixels.take(pairs[:, 1], 0)
+    same = np.flatnonzero(x_and_y[:, 0] & x_and_y[:, 1])
     if not len(same):
         return 0.0
-    alike = before.descriptors[same[:, 0]] == now.descriptors[same[:, 1]]
+    alike = before.descriptors[pairs[same, 0]] == now.descriptors[pairs[same, 1]]
     return float(np.count_nonzero(alike.all(axis=1)) / len(pairs))
 
 
