@@ -24,30 +24,40 @@ MAX_YAML_BYTES = 1_000_000
 MAX_YAML_DEPTH = 20  # of nested lists and mappings
 BASE_60, LONGEST_TIME = re.compile(r"[-+\d_.:]*:[-+\d_.:]*"), 100  # to read 1:1:1:… as YAML 1.1 has it takes time with the square of its length
 SURROGATE, SLOWLY_READ = re.compile(r"\\uDC[89A-F]", re.IGNORECASE), 100_000  # a byte of a path that is not UTF-8, as PyYAML writes it
+PART = 1 << 20  # bytes of a file that are read at once where its size is not known
 SHOWN = 60  # characters of a stranger's text in a message
 STREAMS = (Path("/dev"), Path("/dev/fd"), Path("/proc/self/fd"))  # folders of devices and open files, which nothing may replace
 
 
 def open_file(path: Path) -> BinaryIO:
     """Open a regular file for reading. Raises OSError, for a device, FIFO or socket too, which may never end."""
+    return open(_open_descriptor(path)[0], "rb")
+
+
+def _open_descriptor(path: Path) -> tuple[int, int]:
+    """Open a regular file for reading: its descriptor, and how many bytes it has. Raises OSError as `open_file` does."""
     try:
         descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))  # a FIFO blocks without
     except ValueError as error:  # a NUL in the name
         raise OSError(errno.EINVAL, os.strerror(errno.EINVAL)) from error
-    kind = os.fstat(descriptor).st_mode
-    if not stat.S_ISREG(kind):
+    found = os.fstat(descriptor)
+    if not stat.S_ISREG(found.st_mode):
         os.close(descriptor)
-        raise OSError(errno.EISDIR, os.strerror(errno.EISDIR)) if stat.S_ISDIR(kind) else OSError(errno.EINVAL, "it is not a regular file")
-    return open(descriptor, "rb")
+        raise OSError(errno.EISDIR, os.strerror(errno.EISDIR)) if stat.S_ISDIR(found.st_mode) else OSError(errno.EINVAL, "it is not a regular file")
+    return descriptor, found.st_size
 
 
 def read_file(path: Path, limit: int) -> bytes:
-    """Return the bytes of a regular file. Raises OSError for another kind of file, and for more than `limit` bytes."""
-    with open_file(path) as file:
-        size = os.fstat(file.fileno()).st_size
-        data = file.read(size + 1) if size <= limit else None  # not `limit`: so much memory is allocated before the first byte is read
-        if data is not None and len(data) > size:  # it grows, or is of /proc
-            data += file.read(limit + 1 - len(data))
+    """Return the bytes of a regular file. Raises OSError for another kind of file, and for more than `limit` bytes.
+
+    Four calls of the system, since after each a thread may wait for the interpreter: a file object makes twice as many."""
+    descriptor, size = _open_descriptor(path)
+    try:
+        data = os.read(descriptor, size + 1) if size <= limit else None  # not `limit`: so much memory is allocated before the first byte is read
+        while data is not None and size != len(data) <= limit and (more := os.read(descriptor, PART)):  # it grows, or is of /proc
+            data += more
+    finally:
+        os.close(descriptor)
     if data is None or len(data) > limit:
         raise OSError(errno.EFBIG, f"it has more than {limit} bytes")
     return data
