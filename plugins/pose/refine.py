@@ -125,7 +125,7 @@ class Refine(JudgementOptions):
         pose = with_disagreement(with_turn_difference(pose, previous, tracks, planes), previous, inliers, static)
         points_known, _, planes_known = problem.terms(T)
         pose = with_scale_difference(pose, previous, points_known.positions_m, keypoints.points_m[matches.keypoints[:, 0]])
-        pose = with_plane_offsets(pose, previous, planes_known.coefficients[: len(matches.planes)], planes, matches.planes[:, 0])
+        pose = with_plane_offsets(pose, previous, planes_known.coefficients[: len(matches.planes)], planes, matches.planes)
         pose = with_missing_points(since_loss(pose, previous), previous, problem)
         return judge_by_run(pose, not inliers.most_planes_disagree)
 

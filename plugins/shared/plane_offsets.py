@@ -11,19 +11,20 @@ from dataclasses import replace
 import numpy as np
 
 from trihedron.pipeline.core.linalg import matmul
-from trihedron.pipeline.core.types import F64, I32, Planes, Pose
+from trihedron.pipeline.core.types import F64, I32, Bool, Planes, Pose
 
 LATE, USUAL = 10.0, 100.0  # images full of matched planes that the offset of late, and the usual one, are averaged over
 MOST = 3.5  # times the usual offset; two of 75 simulated sensors exceed it in 20 frames, six sequences come to 2.8
 LEAST = 0.001  # of the distance, that is usual at least
 LEARNED = 2.0  # times the usual offset that a frame counts at most in it: a fault of some seconds does not become usual, and a change for good does
+TINY_M = 1e-6
 
 
-def with_plane_offsets(pose: Pose, previous: Pose, known: F64, planes: Planes, matched: I32) -> Pose:
-    """Give a refined pose the moving averages of how far the planes `matched` (m,) of its frame lie from those of the map, (m, 4) `known` in the
-    world; the previous one's where none is."""
+def with_plane_offsets(pose: Pose, previous: Pose, known: F64, planes: Planes, matches: I32) -> Pose:
+    """Give a refined pose the moving averages of how far the planes of its frame lie from those of the map that they are matched with by `matches`
+    (m, 2: row, id), (m, 4) `known` in the world; the previous one's where none is."""
     late, usual, seen = previous.plane_offsets.tolist()
-    offset, share = plane_offset(matmul(known, pose.T_world_camera), planes, matched)
+    offset, share = plane_offset(matmul(known, pose.T_world_camera), planes, matches, _limit(usual))
     if not seen:
         late = usual = offset
     late += (offset - late) * share / LATE
@@ -31,25 +32,47 @@ def with_plane_offsets(pose: Pose, previous: Pose, known: F64, planes: Planes, m
     return replace(pose, plane_offsets=np.array([late, usual, min(seen + share, USUAL)]))
 
 
-def plane_offset(known: F64, planes: Planes, matched: I32) -> tuple[float, float]:
-    """Return how far half of the area of the planes `matched` (m,) lies at least from where they are `known` (m, 4), in the camera's frame, as a
-    share of its distance; and the area, as a share of the image. Zeros for none."""
-    samples, size = planes.samples_m[matched].astype(np.float64), planes.labels.size * planes.stride**2
+def plane_offset(known: F64, planes: Planes, matches: I32, apart: float) -> tuple[float, float]:
+    """Return how far half of the area of the planes matched by `matches` (m, 2: row, id) lies at least from where they are `known` (m, 4), in the
+    camera's frame, as a share of its distance; and the area, as a share of the image. Zeros for none. Of several that are matched with one plane of
+    the map, those that lie farther than `apart` from the nearest are other surfaces, such as a board on a wall, and do not count."""
+    rows, ids = matches.T
+    samples, size = planes.samples_m[rows].astype(np.float64), planes.labels.size * planes.stride**2
     distances = np.linalg.norm(samples, axis=2)
     usable = (distances > 0.0) & (distances < np.inf)  # NaN is neither
-    plane, counts = np.nonzero(usable)[0], np.count_nonzero(usable, axis=1)
+    counts = np.maximum(np.count_nonzero(usable, axis=1), 1)
+    if len(set(ids.tolist())) < len(ids):
+        centres = np.where(usable[:, :, None], samples, 0.0).sum(axis=1) / counts[:, None]
+        usable &= _on_the_nearest(centres, planes.coefficients[rows], known, ids, apart)[:, None]
+    plane = np.nonzero(usable)[0]
     if not len(plane):
         return 0.0, 0.0
-    points, expected, weights = samples[usable], known[plane], (planes.pixels[matched] / np.maximum(counts, 1))[plane]
+    points, expected, weights = samples[usable], known[plane], (planes.pixels[rows] / counts)[plane]
     offsets = np.abs((points * expected[:, :3]).sum(axis=1) + expected[:, 3]) / distances[usable]
     order = np.argsort(offsets)
     area = np.cumsum(weights[order])
     return float(offsets[order][np.searchsorted(area, area[-1] / 2.0)]), min(float(area[-1]) / size, 1.0)
 
 
+def _on_the_nearest(centres: F64, coefficients: F64, known: F64, ids: I32, apart: float) -> Bool:
+    """Return (m,) True for the planes that lie within `apart`, a share of their distance, of the nearest of those with their id: the one whose centre
+    (m, 3) is nearest to where it is `known`. How far two lie from each other, this frame alone shows: the centre of either from the plane of the
+    other, whichever is nearer, so that a small plane is not extended to a large one."""
+    distances, rows = np.maximum(np.linalg.norm(centres, axis=1), TINY_M), np.arange(len(ids))
+    offsets = np.abs((centres * known[:, :3]).sum(axis=1) + known[:, 3]) / distances
+    nearest = np.where(ids[:, None] == ids, offsets, np.inf).argmin(axis=1)
+    between = np.abs((centres[:, None] * coefficients[:, :3]).sum(axis=2) + coefficients[:, 3]) / distances[:, None]
+    return np.asarray((np.minimum(between[rows, nearest], between[nearest, rows]) <= apart) | (nearest == rows), np.bool_)
+
+
+def _limit(usual: float) -> float:
+    """Return the offset beyond which planes contradict the map."""
+    return MOST * max(usual, LEAST)
+
+
 def contradicting_offsets(pose: Pose) -> str:
     """Return why planes contradict the map, empty where they lie from it about as far as usual."""
     late, usual, _ = pose.plane_offsets.tolist()
-    if late <= MOST * max(usual, LEAST):
+    if late <= _limit(usual):
         return ""
     return f"planes contradict the map: of late they lie {100.0 * late:.1f} % of their distance from where it has them, usually {100.0 * usual:.1f} %"

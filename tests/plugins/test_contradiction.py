@@ -12,6 +12,8 @@ from trihedron.plugins.shared.plane_offsets import plane_offset, with_plane_offs
 
 FIRST = Pose(0, 0, np.eye(4), np.eye(6), np.eye(4), -1, np.zeros(3, np.int32), 0, "ok", "")
 WALLS = np.array([[0.0, 0.0, -1.0, 2.0], [0.0, 0.0, -1.0, 4.0]])  # 2 m and 4 m away, frontal
+MATCHES = np.array([[0, 5], [1, 6]], np.int32)  # with two planes of a map
+APART = 0.0035  # of the distance, at which surfaces are another
 
 
 def planes_of(pixels=(2400, 2400)):
@@ -28,21 +30,41 @@ def followed(pose, frames, off, share=1.0):
     planes, poses = planes_of((int(2400 * share), int(2400 * share))), [pose]
     known = WALLS * [1.0, 1.0, 1.0, 1.0 + off]
     for _ in range(frames):
-        poses.append(with_plane_offsets(poses[-1], poses[-1], known, planes, np.arange(2)))
+        poses.append(with_plane_offsets(poses[-1], poses[-1], known, planes, MATCHES))
     return poses[1:]
 
 
 def test_the_offset_is_that_of_half_of_the_area():
     """The first wall is 2 cm off at 2 m, the second 12 cm at 4 m."""
-    known, both = WALLS + np.array([[0.0, 0.0, 0.0, 0.02], [0.0, 0.0, 0.0, 0.12]]), np.arange(2)
-    assert plane_offset(known, planes_of((2400, 1200)), both) == pytest.approx((0.01, 0.75), abs=1e-6)
-    assert plane_offset(known, planes_of((1200, 2400)), both) == pytest.approx((0.03, 0.75), abs=1e-6)
-    assert plane_offset(known[1:], planes_of(), both[1:]) == pytest.approx((0.03, 0.5), abs=1e-6)
+    known = WALLS + np.array([[0.0, 0.0, 0.0, 0.02], [0.0, 0.0, 0.0, 0.12]])
+    assert plane_offset(known, planes_of((2400, 1200)), MATCHES, APART) == pytest.approx((0.01, 0.75), abs=1e-6)
+    assert plane_offset(known, planes_of((1200, 2400)), MATCHES, APART) == pytest.approx((0.03, 0.75), abs=1e-6)
+    assert plane_offset(known[1:], planes_of(), MATCHES[1:], APART) == pytest.approx((0.03, 0.5), abs=1e-6)
     samples = planes_of().samples_m.copy()
     samples[0, :4], samples[1] = 0.0, [1.0, np.inf, 4.0]  # no points
     strange = dataclasses.replace(planes_of(), samples_m=samples)
-    assert plane_offset(known, strange, both) == pytest.approx((0.01, 0.5), abs=1e-6)
-    assert plane_offset(known[:0], planes_of(), both[:0]) == (0.0, 0.0)
+    assert plane_offset(known, strange, MATCHES, APART) == pytest.approx((0.01, 0.5), abs=1e-6)
+    assert plane_offset(known[:0], planes_of(), MATCHES[:0], APART) == (0.0, 0.0)
+
+
+def test_a_board_on_a_wall_is_no_offset_of_it():
+    """A board 3 cm before a wall in 2 m, both matched with the plane of the wall: the wall counts. Matched alone, the board does, and so do pieces of
+    the wall that lie within `apart` of each other."""
+    planes, wall = planes_of((2400, 1200)), np.repeat(WALLS[:1], 2, axis=0)
+    same = np.array([[0, 5], [1, 5]], np.int32)
+
+    def with_second_at(distance):
+        samples, coefficients = planes.samples_m.copy(), planes.coefficients.copy()
+        samples[1, :, 2] *= distance / 4.0
+        coefficients[1, 3] = distance
+        return dataclasses.replace(planes, samples_m=samples, coefficients=coefficients)
+
+    assert plane_offset(wall, with_second_at(1.97), same, APART) == pytest.approx((0.0, 0.5), abs=1e-6)
+    assert plane_offset(wall, with_second_at(1.97), same[::-1], APART) == pytest.approx((0.0, 0.5), abs=1e-6)
+    assert plane_offset(wall, with_second_at(1.97), MATCHES, APART)[1] == pytest.approx(0.75)
+    assert plane_offset(wall[1:], with_second_at(1.97), same[1:], APART) == pytest.approx((0.03 / 1.97, 0.25), abs=1e-6)
+    assert plane_offset(wall, with_second_at(1.996), same, APART) == pytest.approx((0.0, 0.75), abs=1e-6)
+    assert plane_offset(wall + np.array([0.0, 0.0, 0.0, 0.1]), with_second_at(1.996), same, APART) == pytest.approx((0.05, 0.75), abs=1e-6)
 
 
 def test_planes_that_lie_elsewhere_than_usual_are_a_contradiction():
@@ -80,5 +102,5 @@ def test_planes_count_by_their_area():
     clean = followed(FIRST, 40, 0.005)[-1]
     few = followed(clean, 10, 0.05, share=0.01)
     assert not any(map(contradiction_so_far, few)) and few[-1].plane_offsets[0] < 0.006
-    none = with_plane_offsets(clean, clean, WALLS[:0], planes_of(), np.arange(0))
+    none = with_plane_offsets(clean, clean, WALLS[:0], planes_of(), MATCHES[:0])
     assert np.array_equal(none.plane_offsets, clean.plane_offsets)
