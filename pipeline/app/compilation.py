@@ -3,7 +3,8 @@
 numba compiles one function at a time in a process, and knows the types of the arguments only from a call. So two processes run the graph on small
 images of the built-in room: one as far as the Manhattan frame, then to bundle adjustment, of poses that are not refined; the other with points alone
 to refined poses, then with all stages. What both need is compiled by the one that comes to it first, and loaded from the cache by the other. Both
-take about as long, and neither comes to a part while the other compiles it. A third would, on machines with more cores (decision 337).
+take about as long, and neither comes to a part while the other compiles it. A third process would, so that more cores compile no faster
+(decision 337).
 """
 
 from __future__ import annotations
