@@ -12,7 +12,7 @@ from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat, Posit
 from trihedron.pipeline.core.types import F64, I32, Map, Table
 from trihedron.plugins.mapping.covisibility_graph import covisible_keyframes, current_submap, keyframes_of, newest_keyframes, observed_by, odometry
 from trihedron.plugins.mapping.landmark_kinds import KINDS, LINE, PLANE, POINT, LandmarkKind, observed_rows
-from trihedron.plugins.mapping.landmarks import index_of
+from trihedron.plugins.mapping.landmarks import index_of, isin
 from trihedron.plugins.shared.residuals_kernels import PARALLEL, PERPENDICULAR
 
 
@@ -94,13 +94,19 @@ def free_poses(state: BundleState, free: int) -> F64:
 
 
 def bundle_window(options: WindowOptions, map: Map, least_fixed: int = 1) -> BundleWindow:
-    """Select the newest keyframe and the most covisible ones, and further keyframes, fixed ones, that observe the same landmarks.
+    """Select the newest keyframe and the most covisible ones, and further keyframes, fixed ones: the newest of all others, with which odometry
+    connects those after it, and the ones that observe most of the same landmarks.
 
     The first keyframe defines the world and is always fixed. With fewer than `least_fixed` fixed keyframes the oldest of the window are fixed too,
     which may leave none to adjust."""
     newest = newest_keyframes(map, 1)
-    moving = np.sort(np.concatenate([newest, covisible_keyframes(map, newest, options.keyframes - 1)]))
+    shared = covisible_keyframes(map, newest, options.keyframes - 1)
+    moving = np.sort(np.concatenate([newest, shared]))
     held = covisible_keyframes(map, moving, options.fixed)
+    if len(shared):
+        others = keyframes_of(map, current_submap(map))
+        before = others[~isin(others, moving)][-1:]
+        held = np.concatenate([before, held[~isin(held, before)]])[: options.fixed]
     while len(moving) and (len(held) < least_fixed or moving[0] == 0):
         held, moving = np.append(held, moving[:1]), moving[1:]
     points, lines, planes = (observed_by(map, moving, kind) for kind in KINDS)

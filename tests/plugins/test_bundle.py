@@ -250,6 +250,31 @@ def test_two_walls_leave_the_motion_along_them_where_it_was(room):
     assert np.abs(moved @ along).max() < 2e-3 < 4e-3 < np.linalg.norm(moved, axis=1).max()
 
 
+def in_two_parts(map, later):
+    """The map whose keyframes from `later` on share no point, line or plane with those before, except one wall, which the first two and the newest
+    observed."""
+    tables = {}
+    for kind in ("points", "lines", "planes"):
+        table = getattr(map, kind)
+        observers = table.column("observers")
+        both = (observers >= later).any(axis=1) & ((observers >= 0) & (observers < later)).any(axis=1)
+        tables[kind] = table.updated(np.arange(len(table)), alive=table.column("alive") & ~both)
+    wall = np.array([0])
+    observers = np.full((1, map.planes.column("observers").shape[1]), -1, np.int32)
+    observers[0, :3] = 0, 1, len(map.keyframes) - 1
+    return dataclasses.replace(map, **{**tables, "planes": tables["planes"].updated(wall, alive=np.array([True]), observers=observers)})
+
+
+def test_keyframes_that_a_wall_alone_connects_with_the_rest_stay_where_odometry_has_them(room):
+    """The most covisible keyframes are then at the other end of the map: without the one before in time, 6 to 9 would slide along the wall."""
+    map = in_two_parts(room[1], later=6)
+    window = bundle_window(WindowOptions(6, 3), map)
+    assert window.free.tolist() == [1, 6, 7, 8, 9] and 5 in window.fixed and len(window.fixed) == 4
+    found = solve_bundle(*bundle_problem(BundleOptions(), disturbed(map, window), window), 10)
+    variances = [found.covariance[6 * k : 6 * k + 3, 6 * k : 6 * k + 3] for k in range(len(window.free))]
+    assert np.sqrt(np.linalg.eigvalsh(variances)[:, -1]).max() < 0.1
+
+
 def test_the_cost_of_a_frame_does_not_depend_on_the_size_of_the_map(room, monkeypatch):
     """Matching, inserting a keyframe, adjusting and applying the correction read whole columns of keyframes, and of landmarks only who lives."""
     world, map = room
