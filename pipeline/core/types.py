@@ -331,10 +331,11 @@ class Pose(Value):
     frames in a row since, at most three, that would be ok but for the loss, and with which planes agree. `turn_difference` is the rotation (rad,
     camera frame) by which planes turned more than the pose, as a moving average over ten frames, and `usual_turn_difference` its usual size in one
     frame, 0.3° before the first. `plane_offsets` are how far half of the area of the matched planes lies at least from where the map has them, as a
-    share of its distance, as moving averages over ten images full of matched planes and over a hundred, and how many such images there were, at most
-    a hundred. `usual_accelerations` are the number of frames, at most ten, whose linear (m/s²) and angular (rad/s²) acceleration is known, and the
-    largest of these, less 1 % for each frame since. `scale_difference` is the logarithm of the ratio by which nine of ten distances between matched
-    points are larger than in the map, or below 0 smaller (0 where neither is so), as a moving average over three frames.
+    share of its distance, less where the calibration explains it, as moving averages over ten images full of matched planes and over a hundred, and
+    how many such images there were, at most a hundred. `usual_accelerations` are the number of frames, at most ten, whose linear (m/s²) and angular
+    (rad/s²) acceleration is known, and the largest of these, less 1 % for each frame since. `scale_difference` is the logarithm of the ratio by which
+    nine of ten distances between matched points are larger than in the map, or below 0 smaller (0 where neither is so), as a moving average over
+    three frames.
 
     Five fields are what the pose's error owes to an imperfect calibration (`plugins.shared.calibration_error`, which defines the parameters and their
     units): `sensitivity` is the derivative of the error by them, `calibration_information` and `calibration_score` the information of the residuals

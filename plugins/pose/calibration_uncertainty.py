@@ -26,6 +26,8 @@ from trihedron.plugins.shared.calibration_error_kernels import (
     moved_sensitivity,
     sensitivity_and_evidence,
 )
+from trihedron.plugins.shared.plane_offsets import samples_of
+from trihedron.plugins.shared.plane_offsets_kernels import distance_sigmas
 from trihedron.plugins.shared.pose_optimizer_kernels import Flags
 
 REPEATED_FRAMES = 20  # in which the errors of a landmark's residuals repeat: so many frames tell of the calibration as much as one
@@ -62,6 +64,21 @@ def with_calibration(pose: Pose, previous: Pose, problem: MapAlignment, flags: F
         calibration_score=previous.calibration_score + score / scale,
         depth_scale_sigma=camera.sigmas.depth_scale,
     )
+
+
+def plane_sigmas_m(pose: Pose, problem: MapAlignment) -> F64:
+    """Return (m, s) how far the calibration takes the samples of matched planes (`samples_of`) from those of the map: a standard deviation in metres,
+    NaN for samples that no keyframe which observed the plane had in its image."""
+    planes, map, camera = problem.matches.planes, problem.map, problem.camera
+    known, observers = map.planes.columns_at(planes[:, 1], "coefficients", "observers")
+    rows = np.unique(observers[observers >= 0])
+    observers = np.where(observers >= 0, np.searchsorted(rows, observers), -1).astype(np.int32)
+    return distance_sigmas(
+        constant(pose.T_world_camera, np.float64), camera.intrinsics, camera.width, camera.height, calibration_scales(camera), pose.twist,
+        pose.sensitivity, calibration_moment(pose.calibration_information, pose.calibration_score), known,
+        constant(samples_of(problem.planes, planes), np.float32), observers,
+        keyframes_seen(pose, map, rows, map.keyframes.rows("T_world_camera", rows)),
+    )  # fmt: skip
 
 
 def keyframes_seen(pose: Pose, map: Map, rows: I32, poses: F64) -> Keyframes:

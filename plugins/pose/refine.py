@@ -27,6 +27,7 @@ from trihedron.pipeline.core.types import (
     Translation,
 )
 from trihedron.plugins.mapping.reference_keyframe import reference_of, submap_of, transform_to_map
+from trihedron.plugins.pose.calibration_uncertainty import plane_sigmas_m
 from trihedron.plugins.pose.continuity import with_motion
 from trihedron.plugins.pose.decoupled_pose import FIRST_SIGMA, Decoupled, decoupled_pose
 from trihedron.plugins.pose.dynamic_objects import Selection, solve_with_static
@@ -125,7 +126,8 @@ class Refine(JudgementOptions):
         pose = with_disagreement(with_turn_difference(pose, previous, tracks, planes), previous, inliers, static)
         points_known, _, planes_known = problem.terms(T)
         pose = with_scale_difference(pose, previous, points_known.positions_m, keypoints.points_m[matches.keypoints[:, 0]])
-        pose = with_plane_offsets(pose, previous, planes_known.coefficients[: len(matches.planes)], planes, matches.planes)
+        sigmas_m = plane_sigmas_m(pose, problem)
+        pose = with_plane_offsets(pose, previous, planes_known.coefficients[: len(matches.planes)], planes, matches.planes, sigmas_m)
         pose = with_missing_points(since_loss(pose, previous), previous, problem)
         return judge_by_run(pose, not inliers.most_planes_disagree)
 

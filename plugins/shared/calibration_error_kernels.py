@@ -134,7 +134,7 @@ def _scale_and_subtract(scales: F64, J: F64, A: F64, K: F64) -> None:
 
 
 @kernel(forceinline=True)
-def _to_keyframe(R: F64, t: F64, plane: F64, out: F64) -> None:
+def to_keyframe(R: F64, t: F64, plane: F64, out: F64) -> None:
     """Move a plane (4,) of the world into the frame of a pose R, t."""
     out[3] = plane[3]
     for i in range(3):
@@ -223,7 +223,7 @@ def _add_points(
 
 
 @kernel(forceinline=True)
-def _in_view(p: F64, camera: F64, width: int, height: int) -> bool:
+def in_view(p: F64, camera: F64, width: int, height: int) -> bool:
     if not p[2] > NEAR_M:
         return False
     u, v = camera[0] * p[0] / p[2] + camera[2], camera[1] * p[1] / p[2] + camera[3]
@@ -239,16 +239,16 @@ def _plane_calibration_jacobian(
     and of an observer; and A (6, 12), the observers' mean error. Returns False for too few of them. B (3, 2) are the tangents of its residual."""
     p, q, then = np.empty(3), np.empty(3), np.empty((len(observers), 4))
     now, E, F, mean, row = np.empty(4), np.empty(CALIBRATION), np.empty(CALIBRATION), np.empty(CALIBRATION), np.ones(3)
-    _to_keyframe(R, t, plane, now)
+    to_keyframe(R, t, plane, now)
     for o in range(len(observers)):
         if observers[o] >= 0:
-            _to_keyframe(keyframes.R[observers[o]], keyframes.t[observers[o]], plane, then[o])
+            to_keyframe(keyframes.R[observers[o]], keyframes.t[observers[o]], plane, then[o])
     N, X, seen, total = np.zeros((3, 3)), np.zeros((3, CALIBRATION)), 0, 0
     A[:] = 0.0
     for j in range(len(samples)):
         point = samples[j].astype(np.float64)
         to_camera(R, t, point, p)
-        if not _in_view(p, camera, width, height):
+        if not in_view(p, camera, width, height):
             continue
         mean[:], count = 0.0, 0
         for o in range(len(observers)):
@@ -256,7 +256,7 @@ def _plane_calibration_jacobian(
             if k < 0:
                 continue
             to_camera(keyframes.R[k], keyframes.t[k], point, q)
-            if not _in_view(q, camera, width, height):
+            if not in_view(q, camera, width, height):
                 continue
             plane_point_error(q, then[o], keyframes.twists[k], camera, width, height, E)
             mean += E

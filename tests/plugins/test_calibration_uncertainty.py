@@ -18,6 +18,7 @@ from trihedron.plugins.shared.calibration_error_kernels import (
     keypoint_errors,
     plane_point_error,
 )
+from trihedron.plugins.shared.plane_offsets_kernels import distance_sigmas
 from trihedron.plugins.shared.pose_optimizer import NO_PLANES, solve_pose
 from trihedron.plugins.shared.pose_optimizer_kernels import Flags
 from trihedron.plugins.shared.residuals_kernels import PlaneTerms, PointTerms
@@ -185,6 +186,31 @@ def test_of_a_plane_count_the_samples_that_both_views_show():
     for a, b in zip(equations(both), equations(np.concatenate([both, beside]))):
         assert np.array_equal(a, b)
     assert equations(both).G.any() and not equations(np.concatenate([both[:3], beside])).G.any()
+
+
+@pytest.mark.parametrize("parameter", range(CALIBRATION))
+def test_points_of_a_plane_lie_where_a_camera_with_that_error_puts_them(parameter):
+    """A camera, and two keyframes that observed the plane before it, have the same calibration error, and their poses err by it as well; a third one
+    looked the other way, and so it alone knows nothing of the plane."""
+    rng, T, scale = np.random.default_rng(2), exp_se3(np.array([0.3, 0.05, 0.25, 0.05, 0.14, -0.03])), calibration_scales(CAMERA)[parameter]
+    theta = 1e-4 * scale * np.eye(CALIBRATION)[parameter]
+    seen_by = keyframes_of((*MOVING, (np.diag([-1.0, 1.0, -1.0, 1.0]), TWIST)))
+    seen_by, sensitivity = seen_by._replace(errors=rng.normal(0.0, 0.1, (3, 6, CALIBRATION))), rng.normal(0.0, 0.1, (6, CALIBRATION))
+    world, local, plane = (part[:5] for part in points_on(rng, WALLS[1], T, 12))  # in view of both keyframes, too
+    expected = measured(local, plane, theta, TWIST)[2] @ plane[:3] + plane[3]
+    for pose, twist in MOVING:
+        then = np.append(pose[:3, :3].T @ WALLS[1][:3], WALLS[1][3] + WALLS[1][:3] @ pose[:3, 3])
+        expected -= 0.5 * (measured((world - pose[:3, 3]) @ pose[:3, :3], then, theta, twist)[2] @ then[:3] + then[3])
+    by_poses = 1e-4 * (sensitivity - seen_by.errors[:2].mean(axis=0))[:, parameter]
+    expected += plane[:3] @ by_poses[:3] + np.cross(local, plane[:3]) @ by_poses[3:]
+    moment = 1e-8 * np.outer(np.eye(CALIBRATION)[parameter], np.eye(CALIBRATION)[parameter])
+    samples = np.append(local, [[np.nan] * 3, [0.0] * 3], axis=0)[None].astype(np.float32)
+    for observers, known in (([0, 1, 2, -1], np.abs(expected)), ([2, -1, -1, -1], np.full(5, np.nan))):
+        found = distance_sigmas(
+            T, CAMERA.intrinsics, CAMERA.width, CAMERA.height, calibration_scales(CAMERA), TWIST, sensitivity, moment, WALLS[1:2], samples,
+            np.array([observers], np.int32), seen_by,
+        )  # fmt: skip
+        assert found[0, :5] == pytest.approx(known, rel=1e-3, abs=1e-8, nan_ok=True) and np.isnan(found[0, 5:]).all()
 
 
 def test_moments_of_the_calibration():

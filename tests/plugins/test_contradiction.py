@@ -13,7 +13,8 @@ from trihedron.plugins.shared.plane_offsets import plane_offset, with_plane_offs
 FIRST = Pose(0, 0, np.eye(4), np.eye(6), np.eye(4), -1, np.zeros(3, np.int32), 0, "ok", "")
 WALLS = np.array([[0.0, 0.0, -1.0, 2.0], [0.0, 0.0, -1.0, 4.0]])  # 2 m and 4 m away, frontal
 MATCHES = np.array([[0, 5], [1, 6]], np.int32)  # with two planes of a map
-APART = 0.0035  # of the distance, at which surfaces are another
+USUAL = 0.001  # of the distance; at 3.5 times that surfaces are another
+EXACT = np.zeros((2, 4))  # m, by the calibration, of the samples of both
 
 
 def planes_of(pixels=(2400, 2400)):
@@ -30,21 +31,33 @@ def followed(pose, frames, off, share=1.0):
     planes, poses = planes_of((int(2400 * share), int(2400 * share))), [pose]
     known = WALLS * [1.0, 1.0, 1.0, 1.0 + off]
     for _ in range(frames):
-        poses.append(with_plane_offsets(poses[-1], poses[-1], known, planes, MATCHES))
+        poses.append(with_plane_offsets(poses[-1], poses[-1], known, planes, MATCHES, EXACT))
     return poses[1:]
 
 
 def test_the_offset_is_that_of_half_of_the_area():
     """The first wall is 2 cm off at 2 m, the second 12 cm at 4 m."""
     known = WALLS + np.array([[0.0, 0.0, 0.0, 0.02], [0.0, 0.0, 0.0, 0.12]])
-    assert plane_offset(known, planes_of((2400, 1200)), MATCHES, APART) == pytest.approx((0.01, 0.75), abs=1e-6)
-    assert plane_offset(known, planes_of((1200, 2400)), MATCHES, APART) == pytest.approx((0.03, 0.75), abs=1e-6)
-    assert plane_offset(known[1:], planes_of(), MATCHES[1:], APART) == pytest.approx((0.03, 0.5), abs=1e-6)
+    assert plane_offset(known, planes_of((2400, 1200)), MATCHES, EXACT, USUAL) == pytest.approx((0.01, 0.75), abs=1e-6)
+    assert plane_offset(known, planes_of((1200, 2400)), MATCHES, EXACT, USUAL) == pytest.approx((0.03, 0.75), abs=1e-6)
+    assert plane_offset(known[1:], planes_of(), MATCHES[1:], EXACT[1:], USUAL) == pytest.approx((0.03, 0.5), abs=1e-6)
     samples = planes_of().samples_m.copy()
     samples[0, :4], samples[1] = 0.0, [1.0, np.inf, 4.0]  # no points
     strange = dataclasses.replace(planes_of(), samples_m=samples)
-    assert plane_offset(known, strange, MATCHES, APART) == pytest.approx((0.01, 0.5), abs=1e-6)
-    assert plane_offset(known[:0], planes_of(), MATCHES[:0], APART) == (0.0, 0.0)
+    assert plane_offset(known, strange, MATCHES, EXACT, USUAL) == pytest.approx((0.01, 0.5), abs=1e-6)
+    assert plane_offset(known[:0], planes_of(), MATCHES[:0], EXACT[:0], USUAL) == (0.0, 0.0)
+
+
+def test_what_the_calibration_explains_counts_less():
+    """The walls are 2 cm off at 2 m and 12 cm at 4 m; 0.35 % of the distance would contradict the map. Where the calibration takes them 1 and 12 cm
+    far, twice which is 1 and 6 % of their distance, they count that many times less; and where no keyframe had them in its image not at all."""
+    known = WALLS + np.array([[0.0, 0.0, 0.0, 0.02], [0.0, 0.0, 0.0, 0.12]])
+    sigmas_m = np.repeat([[0.01], [0.12]], 4, axis=1)
+    assert plane_offset(known, planes_of((2400, 1200)), MATCHES, sigmas_m, USUAL) == pytest.approx((0.01 * 0.35, 0.75), abs=1e-6)
+    assert plane_offset(known, planes_of((1200, 2400)), MATCHES, sigmas_m, USUAL) == pytest.approx((0.03 * 0.35 / 6.0, 0.75), abs=1e-6)
+    assert plane_offset(known, planes_of((2400, 1200)), MATCHES, sigmas_m, 3.0 * USUAL) == pytest.approx((0.01, 0.75), abs=1e-6)
+    sigmas_m[1] = np.nan
+    assert plane_offset(known, planes_of(), MATCHES, sigmas_m, USUAL) == pytest.approx((0.01 * 0.35, 0.5), abs=1e-6)
 
 
 def test_a_board_on_a_wall_is_no_offset_of_it():
@@ -59,12 +72,12 @@ def test_a_board_on_a_wall_is_no_offset_of_it():
         coefficients[1, 3] = distance
         return dataclasses.replace(planes, samples_m=samples, coefficients=coefficients)
 
-    assert plane_offset(wall, with_second_at(1.97), same, APART) == pytest.approx((0.0, 0.5), abs=1e-6)
-    assert plane_offset(wall, with_second_at(1.97), same[::-1], APART) == pytest.approx((0.0, 0.5), abs=1e-6)
-    assert plane_offset(wall, with_second_at(1.97), MATCHES, APART)[1] == pytest.approx(0.75)
-    assert plane_offset(wall[1:], with_second_at(1.97), same[1:], APART) == pytest.approx((0.03 / 1.97, 0.25), abs=1e-6)
-    assert plane_offset(wall, with_second_at(1.996), same, APART) == pytest.approx((0.0, 0.75), abs=1e-6)
-    assert plane_offset(wall + np.array([0.0, 0.0, 0.0, 0.1]), with_second_at(1.996), same, APART) == pytest.approx((0.05, 0.75), abs=1e-6)
+    assert plane_offset(wall, with_second_at(1.97), same, EXACT, USUAL) == pytest.approx((0.0, 0.5), abs=1e-6)
+    assert plane_offset(wall, with_second_at(1.97), same[::-1], EXACT, USUAL) == pytest.approx((0.0, 0.5), abs=1e-6)
+    assert plane_offset(wall, with_second_at(1.97), MATCHES, EXACT, USUAL)[1] == pytest.approx(0.75)
+    assert plane_offset(wall[1:], with_second_at(1.97), same[1:], EXACT[1:], USUAL) == pytest.approx((0.03 / 1.97, 0.25), abs=1e-6)
+    assert plane_offset(wall, with_second_at(1.996), same, EXACT, USUAL) == pytest.approx((0.0, 0.75), abs=1e-6)
+    assert plane_offset(wall + np.array([0.0, 0.0, 0.0, 0.1]), with_second_at(1.996), same, EXACT, USUAL) == pytest.approx((0.05, 0.75), abs=1e-6)
 
 
 def test_planes_that_lie_elsewhere_than_usual_are_a_contradiction():
@@ -102,5 +115,5 @@ def test_planes_count_by_their_area():
     clean = followed(FIRST, 40, 0.005)[-1]
     few = followed(clean, 10, 0.05, share=0.01)
     assert not any(map(contradiction_so_far, few)) and few[-1].plane_offsets[0] < 0.006
-    none = with_plane_offsets(clean, clean, WALLS[:0], planes_of(), MATCHES[:0])
+    none = with_plane_offsets(clean, clean, WALLS[:0], planes_of(), MATCHES[:0], EXACT[:0])
     assert np.array_equal(none.plane_offsets, clean.plane_offsets)
