@@ -67,16 +67,14 @@ def with_calibration(pose: Pose, previous: Pose, problem: MapAlignment, flags: F
 
 
 def plane_sigmas_m(pose: Pose, problem: MapAlignment) -> F64:
-    """Return (m, s) how far the calibration takes the samples of matched planes (`samples_of`) from those of the map: a standard deviation in metres,
+    """Return the standard deviations (m, s), by the calibration, of the distances (m) of the samples of matched planes (`samples_of`) from the map's;
     NaN for samples that no keyframe which observed the plane had in its image."""
     planes, map, camera = problem.matches.planes, problem.map, problem.camera
-    known, observers = map.planes.columns_at(planes[:, 1], "coefficients", "observers")
-    rows = np.unique(observers[observers >= 0])
-    observers = np.where(observers >= 0, np.searchsorted(rows, observers), -1).astype(np.int32)
+    rows, _, observed = problem.keyframes
     return distance_sigmas(
         constant(pose.T_world_camera, np.float64), camera.intrinsics, camera.width, camera.height, calibration_scales(camera), pose.twist,
-        pose.sensitivity, calibration_moment(pose.calibration_information, pose.calibration_score), known,
-        constant(samples_of(problem.planes, planes), np.float32), observers,
+        pose.sensitivity, calibration_moment(pose.calibration_information, pose.calibration_score),
+        map.planes.rows("coefficients", planes[:, 1]), constant(samples_of(problem.planes, planes), np.float32), observed.planes,
         keyframes_seen(pose, map, rows, map.keyframes.rows("T_world_camera", rows)),
     )  # fmt: skip
 

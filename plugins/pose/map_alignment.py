@@ -129,6 +129,7 @@ class MapAlignment:
         matches = self.matches
         return np.concatenate([pairs[:, 1] for pairs in (matches.planes, matches.parallel, matches.perpendicular)])
 
+    @cached_property
     def keyframes(self) -> tuple[I32, Groups, Observers]:
         """The keyframes (k,) that created or observed the matched landmarks; which of them created each, and which observed each of the points and of
         the identical planes."""

@@ -82,7 +82,7 @@ def keyframe_covariance(solution: PoseSolution, problem: MapAlignment, factor: f
 
 def in_world(pose: Pose, previous: Pose, solution: PoseSolution, problem: MapAlignment) -> Pose:
     """Give a refined pose with its motion its covariance in the world, scaled by the noise that the residuals show."""
-    rows, created, observed = problem.keyframes()
+    rows, created, observed = problem.keyframes
     poses, covariances = problem.map.keyframes.columns_at(rows, "T_world_camera", "world_covariance")
     T, flags = pose.T_world_camera, Flags(solution.points, solution.lines, solution.planes)
     scale, by_drift, supported = scatter_and_drift(

@@ -143,6 +143,14 @@ def to_keyframe(R: F64, t: F64, plane: F64, out: F64) -> None:
 
 
 @kernel(forceinline=True)
+def to_observers(keyframes: Keyframes, observers: I32, plane: F64, out: F64) -> None:
+    """Move a plane (4,) of the world into the frame of each of its observers, numbers of keyframes: (o, 4). Rows of -1 stay as they are."""
+    for o in range(len(observers)):
+        if observers[o] >= 0:
+            to_keyframe(keyframes.R[observers[o]], keyframes.t[observers[o]], plane, out[o])
+
+
+@kernel(forceinline=True)
 def _add_point_error(q: F64, of_plane: F64, Q: F64, twist: F64, camera: F64, width: int, height: int, D: F64, E: F64, K: F64) -> None:
     """Add `D Q dq/dθ` to K (3, 12): the error of a landmark as a keyframe saw it, q (3,) in its frame, with Q from that frame to the camera's and
     D = dr/dp; `of_plane` (4,) is the surface there. E (3, 12) is overwritten."""
@@ -224,6 +232,7 @@ def _add_points(
 
 @kernel(forceinline=True)
 def in_view(p: F64, camera: F64, width: int, height: int) -> bool:
+    """Return True for a point p (3,) of the camera's frame that the camera has in its image."""
     if not p[2] > NEAR_M:
         return False
     u, v = camera[0] * p[0] / p[2] + camera[2], camera[1] * p[1] / p[2] + camera[3]
@@ -240,9 +249,7 @@ def _plane_calibration_jacobian(
     p, q, then = np.empty(3), np.empty(3), np.empty((len(observers), 4))
     now, E, F, mean, row = np.empty(4), np.empty(CALIBRATION), np.empty(CALIBRATION), np.empty(CALIBRATION), np.ones(3)
     to_keyframe(R, t, plane, now)
-    for o in range(len(observers)):
-        if observers[o] >= 0:
-            to_keyframe(keyframes.R[observers[o]], keyframes.t[observers[o]], plane, then[o])
+    to_observers(keyframes, observers, plane, then)
     N, X, seen, total = np.zeros((3, 3)), np.zeros((3, CALIBRATION)), 0, 0
     A[:] = 0.0
     for j in range(len(samples)):

@@ -7,7 +7,7 @@ import numpy as np
 
 from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import CALIBRATION, F32, F64, I32
-from trihedron.plugins.shared.calibration_error_kernels import Keyframes, in_view, plane_point_error, to_keyframe
+from trihedron.plugins.shared.calibration_error_kernels import Keyframes, in_view, plane_point_error, to_keyframe, to_observers
 from trihedron.plugins.shared.residuals_kernels import to_camera
 
 
@@ -35,9 +35,7 @@ def distance_sigmas(
     E, error = np.empty(CALIBRATION), np.empty(CALIBRATION)
     for i in range(len(planes)):
         to_keyframe(R, t, planes[i], now)
-        for o in range(observers.shape[1]):
-            if observers[i, o] >= 0:
-                to_keyframe(keyframes.R[observers[i, o]], keyframes.t[observers[i, o]], planes[i], then[o])
+        to_observers(keyframes, observers[i], planes[i], then)
         for j in range(samples.shape[1]):
             for a in range(3):
                 p[a] = samples[i, j, a]
