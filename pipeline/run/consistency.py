@@ -69,11 +69,13 @@ def judged_poses(poses: Iterable[Pose]) -> list[Pose]:
 
 
 def truth_noise(poses: F64, local_covariances: F64, true_poses: F64, indices: I32) -> TruthNoise:
-    """Estimate the truth's noise by its motions between neighbouring frames (`indices` (n,)): the median of the squared differences from those of the
-    estimate, less what the estimate's own noise (n, 6, 6), relative to the landmarks near it, explains. Errors that grow slowly are not noise."""
-    first = np.flatnonzero(np.diff(indices) == 1)
-    if not len(first):
+    """Estimate the truth's noise by its motions between neighbouring frames, those whose `indices` (n,) differ least: the median of the squared
+    differences from those of the estimate, less what the estimate's own noise (n, 6, 6), relative to the landmarks near it, explains. Errors that
+    grow slowly are not noise."""
+    apart = np.diff(indices)
+    if not len(apart):
         return TruthNoise()
+    first = np.flatnonzero(apart == apart.min())
     moved, truly = (matmul(invert(T[first]), T[first + 1]) for T in (poses, true_poses))
     errors = np.array([log_se3(motion) for motion in matmul(invert(moved), truly)])
     variances = np.diagonal(local_covariances, axis1=1, axis2=2)

@@ -65,5 +65,17 @@ def test_noise_of_the_truth_is_estimated_and_counted_in(noisy):
     stated = local + np.arange(1, count + 1)[:, None, None] * 1e-10 * np.eye(6)
     found = pose_consistency(poses, stated, measured, noise)
     assert found.nees_mean == pytest.approx(6.0, abs=0.8) and found.truth_sigma_m == noise.sigma_m
-    gaps = np.arange(0, 2 * count, 2, dtype=np.int32)
-    assert truth_noise(poses, local, measured, gaps).sigma_m == 0.0
+    every_third = truth_noise(poses, local, measured, np.arange(0, 3 * count, 3, dtype=np.int32))  # frames of dataset.frames=::3
+    assert every_third == noise
+    assert truth_noise(poses[:1], local[:1], measured[:1], np.array([0], np.int32)).sigma_m == 0.0
+
+
+def test_frames_that_follow_a_gap_say_nothing_about_the_noise_of_the_truth():
+    """Frames are missing behind every third, and the estimate is off by 10 cm more after each gap."""
+    count = 300
+    indices = np.arange(count, dtype=np.int32) + 5 * (np.arange(count, dtype=np.int32) // 3)
+    true = np.broadcast_to(np.eye(4), (count, 4, 4))
+    poses = true.copy()
+    poses[:, 0, 3] = 0.1 * (np.arange(count) // 3)
+    local = np.broadcast_to(1e-6 * np.eye(6), (count, 6, 6))
+    assert truth_noise(poses, local, true, indices).sigma_m == 0.0
