@@ -66,9 +66,8 @@ def close_loop(options: LoopOptions, rank: Callable[[Map], Candidates], map: Map
     if correction is not None or not options.straighten:
         return correction
     count = len(map.keyframes)
-    if count % (options.straighten << (count // (16 * options.straighten)).bit_length()):
-        return None
-    return align_with_manhattan(options, map)
+    period = options.straighten << (count // (16 * options.straighten)).bit_length()
+    return None if count % period else align_with_manhattan(options, map, count - 1 - period)
 
 
 def _first_verified(options: LoopOptions, map: Map, frame: Frame, candidates: Candidates) -> Correction | None:

@@ -6,15 +6,16 @@ once, at the middle one of its observers, so that a wall off the axes errs once 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
 
 from trihedron.pipeline.core.geometry import invert, pose_matrix
-from trihedron.pipeline.core.lie import exp_so3
+from trihedron.pipeline.core.lie import exp_se3, exp_so3
 from trihedron.pipeline.core.linalg import inv, inv_symmetric, matmul
 from trihedron.pipeline.core.types import F64, I32, Correction, Map, Table
+from trihedron.plugins.loop.calibration_turn import errors_by_calibration
 from trihedron.plugins.loop.keyframe_correction import correct_keyframes
 from trihedron.plugins.loop.manhattan_prior_kernels import keyframe_rotations
 from trihedron.plugins.mapping.covisibility_graph import DriftOptions, current_submap, keyframes_of, odometry
@@ -117,20 +118,33 @@ def correct_loop(options: DriftOptions, map: Map, keyframe: int, found: PoseSolu
     return correct_keyframes(map, rows, before, _solve_with_prior(before, edges, prior))
 
 
-def align_with_manhattan(options: StraighteningOptions, map: Map) -> Correction | None:
-    """Rotate every keyframe back to the Manhattan frame of the map; None without one, where the newest would hardly rotate, or some keyframe by more
-    than its plausible drift."""
+def align_with_manhattan(options: StraighteningOptions, map: Map, since: int) -> Correction | None:
+    """Rotate every keyframe back to the Manhattan frame of the map; None without one, or where the newest would hardly rotate.
+
+    What the calibration explains is undone first (`calibration_turn`); keyframes up to the row `since` have been aligned before. The rest is drift,
+    and is left alone where some keyframe would turn by more than is plausible for drift."""
     prior = estimate_manhattan_prior(map)
     if prior is None:
         return None
-    before = map.keyframes.rows("T_world_camera", prior.keyframes)
-    after = _solve_with_prior(before, odometry_edges(options, map, prior.keyframes), prior)
-    cosine = 0.5 * (np.einsum("kij,kij->k", before[:, :3, :3], after[:, :3, :3]) - 1.0)
-    angle = np.arccos(np.clip(cosine, -1.0, 1.0))
-    path_m = np.linalg.norm(np.diff(before[:, :3, 3], axis=0), axis=1).sum()
-    if angle[-1] < np.radians(options.straighten_deg) or angle.max() > PLAUSIBLE * np.radians(options.rotation_drift_deg) * np.sqrt(path_m):
+    before, sensitivity = map.keyframes.columns_at(prior.keyframes, "T_world_camera", "sensitivity")
+    last = max(int(np.searchsorted(prior.keyframes, since, "right")) - 1, 0)
+    xi = errors_by_calibration(before, prior.rotations, prior.information, sensitivity, last)
+    moved = matmul(before, np.array([exp_se3(x) for x in xi]))
+    at_moved = replace(map, keyframes=map.keyframes.updated(prior.keyframes, T_world_camera=moved))
+    rest = replace(prior, rotations=prior.rotations - xi[:, 3:])
+    after = _solve_with_prior(moved, odometry_edges(options, at_moved, prior.keyframes), rest)
+    path_m = np.linalg.norm(np.diff(moved[:, :3, 3], axis=0), axis=1).sum()
+    if _angles(moved, after).max() > PLAUSIBLE * np.radians(options.rotation_drift_deg) * np.sqrt(path_m):
+        after = moved
+    if _angles(before, after)[-1] < np.radians(options.straighten_deg):
         return None
     return correct_keyframes(map, prior.keyframes, before, after)
+
+
+def _angles(before: F64, after: F64) -> F64:
+    """Return the angles (k,), in rad, between poses (k, 4, 4)."""
+    cosine = 0.5 * (np.einsum("kij,kij->k", before[:, :3, :3], after[:, :3, :3]) - 1.0)
+    return np.asarray(np.arccos(np.clip(cosine, -1.0, 1.0)))
 
 
 def _solve_with_prior(before: F64, edges: Edges, prior: ManhattanPrior | None) -> F64:

@@ -7,7 +7,7 @@ import pytest
 
 from trihedron.pipeline.core.geometry import pose_matrix, transform_planes
 from trihedron.pipeline.core.lie import exp_so3, log_so3
-from trihedron.pipeline.core.types import Camera, Frame, Pose
+from trihedron.pipeline.core.types import CALIBRATION, Camera, Frame, Pose
 from trihedron.plugins.loop.appearance import AppearanceLoop
 from trihedron.plugins.loop.manhattan_prior import estimate_manhattan_prior
 from trihedron.plugins.loop.planes import PlanesLoop
@@ -96,3 +96,15 @@ def test_no_alignment_without_a_manhattan_frame():
     assert estimate_manhattan_prior(corridor(DRIFT, wall_deg=20.0)[0]) is None  # walls every way
     assert PlanesLoop()(corridor(np.zeros(3), turned=np.radians(10.0))[0], frame()) is None  # the second half is another wing
     assert PlanesLoop()(corridor(np.zeros(3), turned=np.radians(3.0))[0], frame()) is None
+
+
+def test_a_turn_that_the_calibration_explains_is_undone_though_it_is_no_drift():
+    """The map turns by 3°, six times its plausible drift: left alone, unless a wrong calibration would have turned it alike."""
+    map, truth = corridor(np.radians([0.0, 3.0, 0.0]))
+    assert PlanesLoop()(map, frame()) is None
+    sensitivity = np.zeros((KEYFRAMES, 6, CALIBRATION))
+    sensitivity[:, 3:, 0] = [log_so3(R.T @ truth) / 1.5 for R in map.keyframes.column("T_world_camera")[:, :3, :3]]  # as an error of 1.5 σ
+    explained = dataclasses.replace(map, keyframes=map.keyframes.updated(np.arange(KEYFRAMES), sensitivity=sensitivity))
+    moved = apply_correction(explained, PlanesLoop()(explained, frame()))
+    assert errors_deg(moved.keyframes.column("T_world_camera")[:, :3, :3], truth).max() < 0.5
+    np.testing.assert_array_equal(moved.keyframes.column("T_world_camera")[0], map.keyframes.column("T_world_camera")[0])
