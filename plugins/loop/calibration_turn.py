@@ -11,7 +11,7 @@ import numpy as np
 from trihedron.pipeline.core.geometry import invert
 from trihedron.pipeline.core.lie import adjoint
 from trihedron.pipeline.core.linalg import matmul, solve
-from trihedron.pipeline.core.types import CALIBRATION, F64, I32
+from trihedron.pipeline.core.types import F64, I32
 
 LEAST_F = 10.0  # of Fisher's test; at most 9.5 of 2400 maps whose directions err at random, together over one to eight keyframes
 
@@ -29,15 +29,15 @@ def errors_by_calibration(poses: F64, rotations: F64, information: F64, sensitiv
     errors = np.concatenate([before - first, sensitivity - before], axis=2)  # (k, 6, 24)
     turned, W = matmul(R, rotations[..., None])[..., 0], matmul(R, information, np.swapaxes(R, 1, 2))
     X = np.concatenate([np.broadcast_to(np.eye(3), R.shape), matmul(R, errors[:, 3:])], axis=2)
-    H, b = np.einsum("kia,kij,kjb->ab", X, W, X), np.einsum("kia,kij,kj->a", X, W, turned)
-    prior = np.eye(3 + 2 * CALIBRATION)  # 1 rad of the axes is none
+    rows, weighted, y = X.reshape(-1, X.shape[2]), matmul(W, X).reshape(-1, X.shape[2]), turned.ravel()
+    H, b, prior = matmul(rows.T, weighted), matmul(weighted.T, y), np.eye(X.shape[2])  # a prior of 1 rad for the axes is none
     x = solve(H + prior, b)
-    total = np.einsum("ki,kij,kj->", turned, W, turned)
+    residuals = (y - matmul(rows, x)).reshape(-1, 3)
+    total = (turned * matmul(W, turned[..., None])[..., 0]).sum()
     unexplained = total - matmul(b[:3], solve(H[:3, :3] + np.eye(3), b[:3]))
     left = total - matmul(b, x)  # with the prior's part
     parameters = np.trace(solve(H + prior, H)) - 3.0
-    residuals = turned - np.einsum("kia,a->ki", X, x)
-    freedom = 3.0 * _independent(np.einsum("kij,kj->ki", W, residuals), residuals) - 3.0 - parameters
+    freedom = 3.0 * _independent(matmul(W, residuals[..., None])[..., 0], residuals) - 3.0 - parameters
     if freedom <= 0.0 or (unexplained - left) * freedom < LEAST_F * parameters * left:
         return np.zeros((len(poses), 6))
     return np.asarray(matmul(errors, x[3:]))
