@@ -21,16 +21,16 @@ def errors_by_calibration(poses: F64, rotations: F64, information: F64, sensitiv
     zeros where their directions do not show it.
 
     `rotations` (k, 3) agree best with the axes, with `information` (k, 3, 3), see `ManhattanPrior`; `sensitivity` is (k, 6, 12). Keyframes up to the
-    row `since` may have been corrected before, so that the calibration is estimated for them and for the later ones apart, by least squares with its
-    standard deviations as prior (ridge regression), along with a rotation of all, which is the axes' own error. The calibration must explain more
-    than as many parameters would of noise (F-test)."""
+    row `since` may have been corrected before, so that the calibration is estimated separately for them and for the later ones: by least squares with
+    its standard deviations as prior (ridge regression), together with one rotation of all keyframes, the error of the axes. It counts where it
+    explains more than as many parameters would explain of noise (F-test)."""
     R = poses[:, :3, :3]
     first, before = (_carried(poses, sensitivity, np.minimum(np.arange(len(poses)), row)) for row in (0, since))
     errors = np.concatenate([before - first, sensitivity - before], axis=2)  # (k, 6, 24)
     turned, W = matmul(R, rotations[..., None])[..., 0], matmul(R, information, np.swapaxes(R, 1, 2))
     X = np.concatenate([np.broadcast_to(np.eye(3), R.shape), matmul(R, errors[:, 3:])], axis=2)
     rows, weighted, y = X.reshape(-1, X.shape[2]), matmul(W, X).reshape(-1, X.shape[2]), turned.ravel()
-    H, b, prior = matmul(rows.T, weighted), matmul(weighted.T, y), np.eye(X.shape[2])  # a prior of 1 rad for the axes is none
+    H, b, prior = matmul(rows.T, weighted), matmul(weighted.T, y), np.eye(X.shape[2])  # 1 rad is no constraint on the axes
     x = solve(H + prior, b)
     residuals = (y - matmul(rows, x)).reshape(-1, 3)
     total = (turned * matmul(W, turned[..., None])[..., 0]).sum()
@@ -49,8 +49,8 @@ def _carried(poses: F64, sensitivity: F64, rows: I32) -> F64:
 
 
 def _independent(weighted: F64, residuals: F64) -> float:
-    """Return how many independent ones residuals (k, 3) in a row, `weighted` (k, 3) by their information, are worth, by their autocorrelation (Bayley
-    and Hammersley, 1946): a wall off the axes is seen by several keyframes in a row."""
+    """Return the effective number of independent residuals (k, 3) of successive keyframes, `weighted` (k, 3) by their information, from their
+    autocorrelation (Bayley and Hammersley, 1946): several keyframes in a row observe the same wall off the axes."""
     squares = (weighted * residuals).sum()
     if not squares > 0.0:
         return 0.0
