@@ -64,14 +64,14 @@ def track(camera, now, last):
     )  # fmt: skip
 
 
-def rotation(now, last):
+def rotation(camera, now, last):
     """Section IV-A, eq. 1: the camera's rotation from the axes and R_mw (in `last.rotation`), which the first frame that showed axes defined, so that
     it does not drift from then on. An addition: it is fused by covariance with a prediction, the refined rotation of `last.pose` turned by the motion
     of the pairs; that names the axes (the nearest of their 24 names), and stands alone where none are in view; without pairs, too, the last turn goes
     on. With bundle adjustment or loops the map would tell where the keyframe `last.pose.reference` is now, and the last pose with it; here nothing
     moves it."""
     return drift_free(
-        manhattan=now.axes, tracks=now.tracks, keypoints=now.points, segments=now.segments, planes=now.planes,
+        camera, manhattan=now.axes, tracks=now.tracks, keypoints=now.points, segments=now.segments, planes=now.planes,
         previous=last.rotation, previous_pose=last.pose, map=last.map,
     )  # fmt: skip
 
@@ -123,7 +123,7 @@ def main(folder="", **options):
         normals, now = extract(frame)
         now.axes = manhattan_frame(normals, now, last)
         now.tracks = track(frame.camera, now, last)
-        now.rotation = rotation(now, last)
+        now.rotation = rotation(frame.camera, now, last)
         now.translation = translation(frame.camera, now, last, before_last)
         now.matches = match(frame.camera, now, last)
         now.pose = refine(frame.camera, now, last)

@@ -146,6 +146,15 @@ def test_what_survives(tmp_path, capsys, name):
     check(CASES[name], *run(tmp_path, capsys, CASES[name]))
 
 
+@pytest.mark.parametrize("faults", [{"cover": "10:25", "covered": "depth"}, {"depth_every": 2}])
+def test_frames_without_depth_are_tracked_as_any_other(tmp_path, capsys, faults):
+    """Half a second without depth; depth at 15 Hz of 30, which repeats images and is noticed at the tenth frame."""
+    case = Case(faults, {"length": 40}, said="depth is slower than colour, about 15 Hz instead of 30" if "depth_every" in faults else "")
+    poses, true, said, keyframes = run(tmp_path, capsys, case)
+    check(case, poses, true, said, keyframes)
+    assert sum(pose.status == OK for pose in poses) >= 39
+
+
 def test_frames_that_come_late_again_or_not_at_all(tmp_path, capsys):
     case = Case({"drop": "6:8", "reverse": "12:15", "jump": 20, "jump_s": -10.0, "freeze": "24:27"}, {"length": 34}, said="the clock was set back by")
     poses, true, said, keyframes = run(tmp_path, capsys, case)

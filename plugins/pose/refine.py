@@ -69,7 +69,7 @@ class Refine(JudgementOptions):
     rotation_sigma_deg: PositiveFloat = 0.2  # added to the rotation's own: no scene is exactly Manhattan
     line_sigma_px: PositiveFloat = 1.0  # of a segment's end point across it
     relation_sigma_deg: PositiveFloat = 0.5  # walls are parallel or perpendicular to within this
-    submap_after: NonNegativeInt = 5  # frames without relocalisation, of those that show enough, after which a sub-map begins; 0 = never
+    submap_after: NonNegativeInt = 5  # frames with depth without relocalisation, of those that show enough, after which a sub-map begins; 0 = never
 
     def __post_init__(self) -> None:
         check_increasing(self, "min_inliers", "found_inliers")
@@ -100,7 +100,8 @@ class Refine(JudgementOptions):
         inliers = problem.statistics(solution)
         evidence = Evidence(problem, solution, static, inliers, rotation, translation, tracks, submap, previous)
         if start.status == LOST and not is_found_again(self, evidence):
-            searched = relocalise is not None and translation.estimated
+            with_depth = len(planes.coefficients) > 0 or bool(np.isfinite(keypoints.points_m[:, 2]).any())
+            searched = relocalise is not None and translation.estimated and with_depth
             return self._stay_lost(start, rotation, previous, searched, map, submap)
         if reason := reason_to_be_lost(self, evidence, start.status):
             return self._lost(start, reason, rotation, previous, map, submap)
@@ -151,8 +152,8 @@ class Refine(JudgementOptions):
         return solve_with_static(problem, self)
 
     def _stay_lost(self, start: Decoupled, rotation: Rotation, previous: Pose, searched: bool, map: Map, submap: int) -> Pose:
-        """Return a lost pose; or, once relocalisation has failed for `submap_after` frames (`searched`), the first pose of a sub-map, exact by
-        definition."""
+        """Return a lost pose; or, once relocalisation has failed for `submap_after` frames with depth (`searched`), the first pose of a sub-map,
+        exact by definition: what is mapped without depth has no place."""
         unrecognised = previous.unrecognised + int(searched)
         if not self.submap_after or unrecognised < self.submap_after:
             return self._unrefined(replace(start.to_pose(rotation, map, submap=submap), unrecognised=unrecognised), previous)

@@ -13,7 +13,7 @@ from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.linalg_kernels import inverse_positive, solve_positive
 from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat, PositiveInt, Range
 from trihedron.pipeline.core.registry import register
-from trihedron.pipeline.core.types import F64, Keypoints, ManhattanFrame, Map, Planes, Pose, Rotation, Segments, Tracks
+from trihedron.pipeline.core.types import F64, Camera, Keypoints, ManhattanFrame, Map, Planes, Pose, Rotation, Segments, Tracks
 from trihedron.plugins.mapping.reference_keyframe import transform_rotation_to_map
 from trihedron.plugins.rotation.estimate import IDENTITY, Estimate, rotation_before, rotation_value
 from trihedron.plugins.rotation.known_frames import KnownFrames, Observation
@@ -49,6 +49,7 @@ class DriftFree:
 
     def __call__(
         self,
+        camera: Camera,
         manhattan: ManhattanFrame | None,
         tracks: Tracks | None,
         keypoints: Keypoints,
@@ -66,7 +67,7 @@ class DriftFree:
             known = KnownFrames(previous.R_world_manhattan, previous.ids, previous.weights)
             if refined:
                 known = known.update(previous, before.R, self.max_weight, self.gate * math.radians(self.gate_floor_deg))
-            predicted = compose_with_tracks(self, before, previous.index, tracks, keypoints, segments, planes)
+            predicted = compose_with_tracks(self, camera, before, previous.index, tracks, keypoints, segments, planes)
         known, estimate, seen = self._fuse(known, predicted, manhattan)
         return rotation_value(keypoints.index, keypoints.stamp_ns, estimate, known, seen)
 

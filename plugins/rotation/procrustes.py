@@ -8,7 +8,7 @@ import numpy as np
 
 from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat
 from trihedron.pipeline.core.registry import register
-from trihedron.pipeline.core.types import Keypoints, Map, Planes, Pose, Rotation, Segments, Tracks
+from trihedron.pipeline.core.types import Camera, Keypoints, Map, Planes, Pose, Rotation, Segments, Tracks
 from trihedron.plugins.mapping.reference_keyframe import transform_rotation_to_map
 from trihedron.plugins.rotation.estimate import Estimate, rotation_before, rotation_value
 from trihedron.plugins.rotation.known_frames import KnownFrames
@@ -32,6 +32,7 @@ class Procrustes:
 
     def __call__(
         self,
+        camera: Camera,
         tracks: Tracks | None,
         keypoints: Keypoints,
         segments: Segments,
@@ -44,5 +45,5 @@ class Procrustes:
         estimate = Estimate(np.eye(3), np.zeros((3, 3)), "prediction")
         if previous is not None:
             before, _ = rotation_before(*transform_rotation_to_map(previous, previous_pose, map), self.pose_floor_deg)
-            estimate = compose_with_tracks(self, before, previous.index, tracks, keypoints, segments, planes)
+            estimate = compose_with_tracks(self, camera, before, previous.index, tracks, keypoints, segments, planes)
         return rotation_value(keypoints.index, keypoints.stamp_ns, estimate, KnownFrames.none(), np.zeros((0, 3, 3)))

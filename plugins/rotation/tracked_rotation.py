@@ -9,7 +9,7 @@ import numpy as np
 
 from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.linalg_kernels import solve_positive
-from trihedron.pipeline.core.types import Keypoints, Planes, Segments, Tracks
+from trihedron.pipeline.core.types import Camera, Keypoints, Planes, Segments, Tracks
 from trihedron.plugins.rotation.estimate import IDENTITY, Estimate
 from trihedron.plugins.shared.relative_motion import MotionOptions, solve_motion
 
@@ -28,6 +28,7 @@ class TrackOptions(MotionOptions, Protocol):
 
 def compose_with_tracks(
     options: TrackOptions,
+    camera: Camera,
     before: Estimate,
     previous_index: int,
     tracks: Tracks | None,
@@ -42,7 +43,7 @@ def compose_with_tracks(
     gap = max(keypoints.index - previous_index, 1)
     if tracks is None or tracks.previous_index != previous_index:
         return Estimate(before.R, before.covariance + IDENTITY * math.radians(options.prior_deg * gap) ** 2, "prediction")
-    motion = solve_motion(options, tracks, keypoints, segments, planes, gap)
+    motion = solve_motion(options, camera, tracks, keypoints, segments, planes, gap)
     added = motion.covariance[:3, :3]
     if motion.support == 0.0 and before.covariance.trace() / 3.0 >= options.predict_frames * math.radians(options.prior_deg) ** 2:  # long ago
         return Estimate(before.R, before.covariance + added, "prediction")

@@ -7,15 +7,15 @@ from typing import Protocol
 
 import numpy as np
 
-from trihedron.pipeline.core.types import F64, Keypoints, Planes, Segments, Tracks
+from trihedron.pipeline.core.types import F64, Camera, Keypoints, Planes, Segments, Tracks
 from trihedron.plugins.shared.relative_motion_kernels import LinePairs, PlanePairs, PointPairs, estimate_motion
 
 
 def pairs_of(tracks: Tracks, keypoints: Keypoints, segments: Segments, planes: Planes) -> tuple[PointPairs, LinePairs, PlanePairs]:
     """Pair the tracked features of the previous frame with the current features."""
     return (
-        PointPairs(tracks.keypoints, tracks.points_m, tracks.sigma_m, keypoints.points_m, keypoints.sigma_px, keypoints.sigma_m),
-        LinePairs(tracks.segments, tracks.endpoints_m, segments.endpoints_m, segments.covariance_m2),
+        PointPairs(tracks.keypoints, tracks.points_m, tracks.sigma_m, keypoints.points_m, keypoints.pixels, keypoints.sigma_px, keypoints.sigma_m),
+        LinePairs(tracks.segments, tracks.endpoints_m, segments.endpoints_m, segments.endpoints_px, segments.covariance_m2),
         PlanePairs(tracks.planes, tracks.coefficients, tracks.plane_covariance, planes.coefficients, planes.covariance),
     )
 
@@ -51,7 +51,9 @@ class MotionOptions(Protocol):
         """Least error of a tracked plane's normal."""
 
 
-def solve_motion(options: MotionOptions, tracks: Tracks, keypoints: Keypoints, segments: Segments, planes: Planes, gap: int) -> Motion:
+def solve_motion(
+    options: MotionOptions, camera: Camera, tracks: Tracks, keypoints: Keypoints, segments: Segments, planes: Planes, gap: int
+) -> Motion:
     """Estimate the motion that most tracks agree on, with priors on their predicted rotation and on no translation over `gap` frames.
 
     Pairs that are not finite, or without covariance, are skipped. Graduated non-convexity (Yang et al., RA-L 2020): the Geman–McClure scale comes
@@ -59,4 +61,4 @@ def solve_motion(options: MotionOptions, tracks: Tracks, keypoints: Keypoints, s
     covariance of the prior."""
     floor, sigma, sigma_m = np.radians(options.plane_floor_deg), np.radians(options.prior_deg * gap), options.prior_m * gap
     noise = float(options.angle_px), float(floor), float(sigma), float(sigma_m)
-    return Motion(*estimate_motion(*pairs_of(tracks, keypoints, segments, planes), tracks.R_current_previous, noise))
+    return Motion(*estimate_motion(*pairs_of(tracks, keypoints, segments, planes), camera.intrinsics, tracks.R_current_previous, noise))

@@ -1,7 +1,8 @@
 """Kernels of `relative_motion.py`: robust Gauss–Newton for the motion between two frames from 3D features matched in both.
 
 The motion is `T_current_previous`: `p_current = R p_previous + t`, with parameters (phi, rho) in `R <- Exp(phi) R, t <- t + rho`. Points and ends of
-lines are point pairs with a 3 × 3 information, zero along a line; planes are pairs (n, d) with a 4 × 4 information. No intrinsics are needed.
+lines are point pairs with a 3 × 3 information: zero along a line; of those without depth in the current frame zero along the ray of a point, and
+within the plane through a line and the camera. Planes are pairs (n, d) with a 4 × 4 information.
 """
 # mypy: disable-error-code="arg-type, assignment, index, return-value"
 
@@ -28,6 +29,7 @@ class PointPairs(NamedTuple):
     before: F32  # (n, 3)
     before_sigma: F32  # (n,) of their depth
     points: F32  # (k, 3) current
+    pixels: F32  # (k, 2)
     sigma_px: F32  # (k,) across the ray
     sigma_m: F32  # (k,) along it
 
@@ -38,6 +40,7 @@ class LinePairs(NamedTuple):
     rows: I32  # (n, 2) previous, current
     before: F32  # (n, 2, 3)
     endpoints: F32  # (k, 2, 3) current
+    pixels: F32  # (k, 2, 2)
     covariance: F32  # (k, 2, 3, 3)
 
 
@@ -67,13 +70,13 @@ class Terms(NamedTuple):
 
 @kernel
 def estimate_motion(
-    points: PointPairs, lines: LinePairs, walls: PlanePairs, start: F64, noise: tuple[float, float, float, float]
+    points: PointPairs, lines: LinePairs, walls: PlanePairs, camera: F64, start: F64, noise: tuple[float, float, float, float]
 ) -> tuple[F64, F64, F64, float]:
     """Estimate the fields of `Motion` from `start` (3, 3) and zero translation; see `solve_motion`.
 
     The residuals' scale multiplies the covariance where they exceed their noise."""
     rad_per_px, floor, sigma, sigma_m = noise
-    terms = _gather_terms(points, lines, walls, rad_per_px, floor)
+    terms = _gather_terms(points, lines, walls, camera, rad_per_px, floor)
     R, t, prior, A = np.empty((3, 3)), np.zeros(3), np.empty(6), np.empty((6, 6))
     for i in range(3):
         prior[i], prior[3 + i] = 1.0 / sigma**2, 1.0 / sigma_m**2
@@ -122,38 +125,49 @@ def _gauss_newton(terms: Terms, R: F64, t: F64, prior: F64, scale2: float) -> tu
 
 
 @kernel
-def _gather_terms(points: PointPairs, lines: LinePairs, walls: PlanePairs, rad_per_px: float, floor: float) -> Terms:
+def _gather_terms(points: PointPairs, lines: LinePairs, walls: PlanePairs, camera: F64, rad_per_px: float, floor: float) -> Terms:
     """Gather the terms of all pairs, about MOST points at most."""
     n, m = len(points.rows), len(lines.rows)
     step = max((n + 2 * m + MOST - 1) // MOST, 1)
     before, after, information = np.empty((n + 2 * m, 3)), np.empty((n + 2 * m, 3)), np.empty((n + 2 * m, 3, 3))
-    count = fill_point_pairs(points, rad_per_px, step, before, after, information)
-    count = fill_line_pairs(lines, rad_per_px, step, count, before, after, information)
+    count = fill_point_pairs(points, camera, rad_per_px, step, before, after, information)
+    count = fill_line_pairs(lines, camera, rad_per_px, step, count, before, after, information)
     planes_before, planes_after, plane_information = plane_pairs(walls, floor)
     return Terms(before[:count], after[:count], information[:count], planes_before, planes_after, plane_information)
 
 
 @kernel
-def fill_point_pairs(pairs: PointPairs, rad_per_px: float, step: int, p: F64, q: F64, information: F64) -> int:
-    """Write positions (m, 3) before and after, and information (m, 3, 3), 1/m², of every `step`-th pair with depth in both frames; return m.
+def fill_point_pairs(pairs: PointPairs, camera: F64, rad_per_px: float, step: int, p: F64, q: F64, information: F64) -> int:
+    """Write positions (m, 3) before and after, and information (m, 3, 3), 1/m², of every `step`-th pair with depth in the previous frame; return m.
 
-    The covariance is that of the pixel across the ray and of both depths along it, inverted by Sherman–Morrison."""
-    rows, before, before_sigma, points, sigma_px, sigma_m = pairs
+    The covariance is that of the pixel across the ray and of both depths along it, inverted by Sherman–Morrison. Without depth in the current frame
+    nothing is known along the ray, and the position on it is that at the previous depth."""
+    rows, before, before_sigma, points, pixels, sigma_px, sigma_m = pairs
+    fx, fy, cx, cy = camera[0], camera[1], camera[2], camera[3]
     m, seen = 0, 0
     for i in range(len(rows)):
         row = rows[i, 1]
-        z = float(points[row, 2])
-        if not (np.isfinite(before[i, 2]) and np.isfinite(z)):
+        then, z = float(before[i, 2]), float(points[row, 2])
+        if not np.isfinite(then):
             continue
         seen += 1
         if (seen - 1) % step:
             continue
-        across = sigma_px[row] * rad_per_px * np.sqrt(float(before[i, 2]) ** 2 + z * z)
-        along2 = float(before_sigma[i]) ** 2 + float(sigma_m[row]) ** 2
+        measured = np.isfinite(z)
+        if not measured:
+            z = then
+        across = sigma_px[row] * rad_per_px * np.sqrt(then**2 + z * z)
         for k in range(3):
-            p[m, k], q[m, k] = before[i, k], points[row, k]
+            p[m, k] = before[i, k]
+        if measured:
+            q[m, 0], q[m, 1], q[m, 2] = points[row, 0], points[row, 1], z
+        else:
+            q[m, 0], q[m, 1], q[m, 2] = z * (pixels[row, 0] - cx) / fx, z * (pixels[row, 1] - cy) / fy, z
         x, y = q[m, 0] / z, q[m, 1] / z
-        shrink = along2 / (across * across + along2 * (x * x + y * y + 1.0))  # Sherman–Morrison
+        shrink = 1.0 / (x * x + y * y + 1.0)
+        if measured:
+            along2 = float(before_sigma[i]) ** 2 + float(sigma_m[row]) ** 2
+            shrink = along2 / (across * across + along2 * (x * x + y * y + 1.0))  # Sherman–Morrison
         total = 0.0
         for a in range(3):
             for b in range(3):
@@ -165,11 +179,12 @@ def fill_point_pairs(pairs: PointPairs, rad_per_px: float, step: int, p: F64, q:
 
 
 @kernel
-def fill_line_pairs(pairs: LinePairs, rad_per_px: float, step: int, m: int, p: F64, q: F64, information: F64) -> int:
+def fill_line_pairs(pairs: LinePairs, camera: F64, rad_per_px: float, step: int, m: int, p: F64, q: F64, information: F64) -> int:
     """Write both ends of every `step`-th previous line, each against the start of the current line, from row m on; return the next row.
 
-    The information is that of the current ends across the line, halved since its start serves twice, and zero along the line."""
-    rows, before, endpoints, covariance = pairs
+    The information is that of the current ends across the line, halved since its start serves twice, and zero along the line. A current line without
+    depth is known to lie in the plane through it and the camera, within a pixel."""
+    rows, before, endpoints, pixels, covariance = pairs
     seen, direction, B, S = 0, np.empty(3), np.empty((3, 2)), np.empty((2, 2))
     for i in range(len(rows)):
         row = rows[i, 1]
@@ -178,10 +193,13 @@ def fill_line_pairs(pairs: LinePairs, rad_per_px: float, step: int, m: int, p: F
             direction[k] = float(endpoints[row, 1, k]) - float(endpoints[row, 0, k])
             length2 += direction[k] * direction[k]
             known += before[i, 0, k] + before[i, 1, k]
-        if not (length2 > SHORTEST_M * SHORTEST_M and np.isfinite(length2) and np.isfinite(known)):
+        if not np.isfinite(known) or length2 <= SHORTEST_M * SHORTEST_M:
             continue
         seen += 1
         if (seen - 1) % step:
+            continue
+        if not np.isfinite(length2):
+            m += _fill_within_plane(before[i], pixels[row], camera, rad_per_px, p[m : m + 2], q[m : m + 2], information[m : m + 2])
             continue
         for k in range(3):
             direction[k] /= np.sqrt(length2)
@@ -204,6 +222,26 @@ def fill_line_pairs(pairs: LinePairs, rad_per_px: float, step: int, m: int, p: F
                     information[m + end, a, b] = 0.5 * (B[a, 0] * first + B[a, 1] * second) / det
         m += 2
     return m
+
+
+@kernel
+def _fill_within_plane(before: F32, pixels: F32, camera: F64, rad_per_px: float, p: F64, q: F64, information: F64) -> int:
+    """Write both ends (2, 3) of a previous line, each against the camera, with information across the plane through it and the current `pixels`
+    (2, 2) of its ends; return 2, or 0 for ends that are one."""
+    fx, fy, cx, cy = camera[0], camera[1], camera[2], camera[3]
+    x0, y0, x1, y1 = (pixels[0, 0] - cx) / fx, (pixels[0, 1] - cy) / fy, (pixels[1, 0] - cx) / fx, (pixels[1, 1] - cy) / fy
+    a, b, c = y0 - y1, x1 - x0, x0 * y1 - y0 * x1
+    length2 = a * a + b * b + c * c
+    if not length2 > 0.0:
+        return 0
+    for end in range(2):
+        weight = 1.0 / (length2 * max(rad_per_px * float(before[end, 2]), 1e-6) ** 2)
+        for j in range(3):
+            p[end, j], q[end, j] = before[end, j], 0.0
+            for k in range(3):
+                n, o = (a if j == 0 else b if j == 1 else c), (a if k == 0 else b if k == 1 else c)
+                information[end, j, k] = weight * n * o
+    return 2
 
 
 @kernel

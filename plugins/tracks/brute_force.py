@@ -11,7 +11,7 @@ from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Camera, Keypoints, Planes, Segments, Tracks
 from trihedron.plugins.shared.feature_matching import mutual_matches
 from trihedron.plugins.shared.relative_motion import solve_motion
-from trihedron.plugins.tracks.feature_pairs import NO_PAIRS, Features, StructureGates, tracks_value
+from trihedron.plugins.tracks.feature_pairs import NO_PAIRS, Features, StructureGates, tracks_value, with_carried_depth
 
 
 @register("tracks", "brute_force")
@@ -37,15 +37,17 @@ class BruteForce:
         previous_keypoints: Keypoints | None,
         previous_segments: Segments | None,
         previous_planes: Planes | None,
+        previous: Tracks | None,
     ) -> Tracks | None:
         """Return the pairs with the previous frame; None for the first frame, no pairs when the previous features are too old."""
         if previous_keypoints is None or previous_segments is None or previous_planes is None:
             return None
-        now, before = Features(keypoints, segments, planes), Features(previous_keypoints, previous_segments, previous_planes)
+        now = Features(keypoints, segments, planes)
+        before = with_carried_depth(Features(previous_keypoints, previous_segments, previous_planes), previous, self, camera)
         gap = keypoints.index - before.keypoints.index
         if gap > self.max_age:
             return tracks_value(now, before, (NO_PAIRS, NO_PAIRS, NO_PAIRS), np.eye(3))
         points = mutual_matches(before.keypoints.descriptors, keypoints.descriptors, keypoints.metric, self.ratio)
         tracks = tracks_value(now, before, (points, NO_PAIRS, NO_PAIRS), np.eye(3))
-        motion = solve_motion(self, tracks, keypoints, segments, planes, gap)
+        motion = solve_motion(self, camera, tracks, keypoints, segments, planes, gap)
         return tracks_value(now, before, (points, *StructureGates().pairs(now, before, camera, motion.R, motion.t)), motion.R)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from trihedron.pipeline.core.kernel import constant
 from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import F32, F64, I32, Camera, Keypoints, Planes, Segments, Tracks
 from trihedron.plugins.shared.feature_matching import associate_planes, match_lines
+from trihedron.plugins.shared.relative_motion import MotionOptions, solve_motion
 from trihedron.plugins.tracks.feature_pairs_kernels import pairs_of_matches, predict_pixels_kernel
 
 NO_PAIRS = np.zeros((0, 2), np.int32)
@@ -48,6 +49,21 @@ class StructureGates:
         samples = (matmul(before.planes.samples_m, R.T) + t).astype(np.float32)
         planes = associate_planes(now.planes.coefficients, now.planes.samples_m, known, samples, self.plane_deg, self.plane_m, many_to_one=True)
         return pairs_of_matches(lines), np.ascontiguousarray(planes[:, ::-1])
+
+
+def with_carried_depth(before: Features, tracks: Tracks | None, options: MotionOptions, camera: Camera) -> Features:
+    """Give the key points and lines of a previous frame without any depth the positions of those that its `tracks` found them to be, moved as these
+    have. So a frame that comes without depth, or several in a row, does not interrupt the tracks."""
+    points, lines = before.keypoints, before.segments
+    if tracks is None or tracks.index != points.index or np.isfinite(points.points_m[:, 2]).any():
+        return before
+    motion = solve_motion(options, camera, tracks, points, lines, before.planes, max(tracks.index - tracks.previous_index, 1))
+    positions, sigmas, ends = points.points_m.copy(), points.sigma_m.copy(), lines.endpoints_m.copy()
+    row, depth = tracks.keypoints[:, 1], matmul(tracks.points_m, motion.R[2]) + motion.t[2]
+    positions[row] = camera.back_project(points.pixels[row], np.where(depth > 0.0, depth, np.nan))
+    sigmas[row] = np.hypot(tracks.sigma_m, np.sqrt(motion.covariance[5, 5]))
+    ends[tracks.segments[:, 1]] = matmul(tracks.endpoints_m, motion.R.T) + motion.t
+    return replace(before, keypoints=replace(points, points_m=positions, sigma_m=sigmas), segments=replace(lines, endpoints_m=ends))
 
 
 def tracks_value(now: Features, before: Features, pairs: tuple[I32, I32, I32], R_current_previous: F64) -> Tracks:

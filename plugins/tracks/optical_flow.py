@@ -13,7 +13,7 @@ from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat, Posit
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F32, I32, Bool, Frame, Keypoints, Planes, Segments, Tracks
 from trihedron.plugins.shared.relative_motion import solve_motion
-from trihedron.plugins.tracks.feature_pairs import NO_PAIRS, Features, StructureGates, tracks_value
+from trihedron.plugins.tracks.feature_pairs import NO_PAIRS, Features, StructureGates, tracks_value, with_carried_depth
 from trihedron.plugins.tracks.optical_flow_kernels import nearest_pixels
 
 
@@ -49,7 +49,8 @@ class OpticalFlow:
         """Return the pairs with the previous frame; None for the first frame, no pairs when the previous features are too old."""
         if previous_frame is None or previous_keypoints is None or previous_segments is None or previous_planes is None:
             return None
-        now, before = Features(keypoints, segments, planes), Features(previous_keypoints, previous_segments, previous_planes)
+        now = Features(keypoints, segments, planes)
+        before = with_carried_depth(Features(previous_keypoints, previous_segments, previous_planes), previous, self, frame.camera)
         gap, R = frame.index - previous_frame.index, np.eye(3)
         if previous is not None and previous.index == previous_frame.index and previous.index > previous.previous_index:
             R = exp_so3(gap / (previous.index - previous.previous_index) * log_so3(previous.R_current_previous))
@@ -57,7 +58,7 @@ class OpticalFlow:
             return tracks_value(now, before, (NO_PAIRS, NO_PAIRS, NO_PAIRS), R)
         points = self._points(frame, previous_frame, keypoints, before.keypoints)
         tracks = tracks_value(now, before, (points, NO_PAIRS, NO_PAIRS), R)
-        motion = solve_motion(self, tracks, keypoints, segments, planes, gap)
+        motion = solve_motion(self, frame.camera, tracks, keypoints, segments, planes, gap)
         return tracks_value(now, before, (points, *StructureGates().pairs(now, before, frame.camera, motion.R, motion.t)), motion.R)
 
     def _points(self, frame: Frame, previous_frame: Frame, now: Keypoints, before: Keypoints) -> I32:

@@ -17,7 +17,7 @@ from trihedron.plugins.shared.feature_matching import compared_by, mutual_matche
 from trihedron.plugins.shared.feature_matching_kernels import U64, associate_planes_kernel, line_matches, near_matches
 from trihedron.plugins.shared.relative_motion import Motion, solve_motion
 from trihedron.plugins.shared.rigid_alignment import consensus, tracked_point_pairs
-from trihedron.plugins.tracks.feature_pairs import NO_PAIRS, Features, tracks_value
+from trihedron.plugins.tracks.feature_pairs import NO_PAIRS, Features, tracks_value, with_carried_depth
 from trihedron.plugins.tracks.feature_pairs_kernels import pairs_of_matches
 from trihedron.plugins.tracks.projection_kernels import FeaturePositions, Intrinsics, consistent_pairs, predict_features
 
@@ -78,7 +78,8 @@ class Projection:
         """Return the pairs with the previous frame; None for the first frame, no pairs when the previous features are too old."""
         if previous_keypoints is None or previous_segments is None or previous_planes is None:
             return None
-        now, before = Features(keypoints, segments, planes), Features(previous_keypoints, previous_segments, previous_planes)
+        now = Features(keypoints, segments, planes)
+        before = with_carried_depth(Features(previous_keypoints, previous_segments, previous_planes), previous, self, camera)
         gap = keypoints.index - previous_keypoints.index
         rotations = self._predictions(gap, before.keypoints.index, manhattan, previous_manhattan, previous)
         if gap > self.max_age:
@@ -88,16 +89,16 @@ class Projection:
         first = max((search(R, NOT_MOVED, radius, self.plane_m) for R in rotations), key=_count)
         if len(first.keypoints) < min(self.enough, len(keypoints.pixels)):
             first = search(first.R_current_previous, NOT_MOVED, 2.0 * radius, self.plane_m)
-        motion = self._motion(first, now, gap)
+        motion = search.motion(first)
         again = search(motion.R, motion.t, self.near_px, self.plane_near_m)
         again = again if _count(again) >= 0.7 * _count(first) else first
-        found = search.consistent(again, self._motion(again, now, gap))
+        found = search.consistent(again, search.motion(again))
         if len(found.keypoints) >= min(self.wide_below, len(keypoints.pixels)):
             return found
-        wide = self._wide_baseline(search, now, before, gap, rng)
+        wide = self._wide_baseline(search, now, before, rng)
         return wide if wide is not None and len(wide.keypoints) > len(found.keypoints) else found
 
-    def _wide_baseline(self, search: Search, now: Features, before: Features, gap: int, rng: np.random.Generator) -> Tracks | None:
+    def _wide_baseline(self, search: Search, now: Features, before: Features, rng: np.random.Generator) -> Tracks | None:
         """Track without a prediction: mutual nearest descriptors, the rigid motion that most of them agree on (RANSAC), then all features around it.
         None when fewer than `wide_inliers` agree."""
         pairs = mutual_matches(before.keypoints.descriptors, now.keypoints.descriptors, now.keypoints.metric, self.ratio)
@@ -105,9 +106,9 @@ class Projection:
         rigid = consensus(*tracked_point_pairs(unguided, now.keypoints), self.wide_gate, self.wide_rounds, rng)
         if np.count_nonzero(rigid.agree) < self.wide_inliers:
             return None
-        motion = self._motion(search(rigid.R, rigid.t, self.radius_px, self.plane_m), now, gap)
+        motion = search.motion(search(rigid.R, rigid.t, self.radius_px, self.plane_m))
         again = search(motion.R, motion.t, self.near_px, self.plane_near_m)
-        return search.consistent(again, self._motion(again, now, gap))
+        return search.consistent(again, search.motion(again))
 
     def _predictions(
         self, gap: int, previous_index: int, manhattan: ManhattanFrame | None, previous_manhattan: ManhattanFrame | None, previous: Tracks | None
@@ -122,9 +123,6 @@ class Projection:
             if relative is not None and all(rotation_angle_deg(matmul(relative, R.T)) > self.prior_deg for R in found):
                 found.append(relative)
         return found or [np.eye(3)]
-
-    def _motion(self, tracks: Tracks, now: Features, gap: int) -> Motion:
-        return solve_motion(self, tracks, now.keypoints, now.segments, now.planes, gap)
 
 
 def _manhattan_rotation(now: ManhattanFrame, before: ManhattanFrame) -> F64 | None:
@@ -167,6 +165,11 @@ class Search:
         )  # fmt: skip
         same = associate_planes_kernel(seen.coefficients, seen.samples_m, planes, samples, cosine, plane_m, True)
         return tracks_value(self.now, self.before, (pairs_of_matches(points), pairs_of_matches(lines), np.ascontiguousarray(same[:, ::-1])), R)
+
+    def motion(self, tracks: Tracks) -> Motion:
+        """Return the motion that most of the pairs agree on."""
+        now = self.now
+        return solve_motion(self.options, self.camera, tracks, now.keypoints, now.segments, now.planes, tracks.index - tracks.previous_index)
 
     def consistent(self, tracks: Tracks, motion: Motion) -> Tracks:
         """Reject the key points and lines farther than `error_px` σ from their prediction by the motion, and key points without depth in both."""

@@ -81,7 +81,7 @@ class LevenbergMarquardt:
         T, uncertain = constant(T, np.float64), constant(uncertain, np.float64)
         fx, fy, noise = float(camera.fx), float(camera.fy), camera.depth_noise.coefficients
         return (
-            tracked_points(points, keypoints.pixels, fx, fy, T, uncertain),
-            tracked_lines(lines, segments.endpoints_px, math.hypot(self.line_sigma_px, keypoints.blur_px), noise, fx, fy, T, uncertain),
+            tracked_points(points, fx, fy, T, uncertain),
+            tracked_lines(lines, math.hypot(self.line_sigma_px, keypoints.blur_px), noise, fx, fy, T, uncertain),
             tracked_planes(walls, T, uncertain),
         )

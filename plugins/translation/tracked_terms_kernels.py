@@ -14,10 +14,10 @@ from trihedron.plugins.shared.residuals_kernels import SAME, LineTerms, PlaneTer
 
 
 @kernel
-def tracked_points(pairs: PointPairs, pixels: F32, fx: float, fy: float, T: F64, rotation_covariance: F64) -> PointTerms:
-    """Terms of the tracked points with a previous depth, observed at some of `pixels` (k, 2); T (4, 4) and `rotation_covariance` (3, 3) as in
+def tracked_points(pairs: PointPairs, fx: float, fy: float, T: F64, rotation_covariance: F64) -> PointTerms:
+    """Terms of the tracked points with a previous depth; T (4, 4) and `rotation_covariance` (3, 3) as in
     `placed_points`."""
-    rows, before, before_sigma, points, sigma_px, sigma_m = pairs
+    rows, before, before_sigma, points, pixels, sigma_px, sigma_m = pairs
     known = np.empty(len(rows), np.int32)
     n = 0
     for i in range(len(rows)):
@@ -37,10 +37,10 @@ def tracked_points(pairs: PointPairs, pixels: F32, fx: float, fy: float, T: F64,
 
 @kernel
 def tracked_lines(
-    pairs: LinePairs, pixels: F32, sigma_px: float, noise: tuple[float, float, float, float], fx: float, fy: float, T: F64, rotation_covariance: F64
+    pairs: LinePairs, sigma_px: float, noise: tuple[float, float, float, float], fx: float, fy: float, T: F64, rotation_covariance: F64
 ) -> LineTerms:
-    """Terms of the tracked lines with previous 3D end points, observed at some of `pixels` (k, 2, 2) with `sigma_px`."""
-    rows, before, endpoints, covariance = pairs
+    """Terms of the tracked lines with previous 3D end points, observed with `sigma_px`."""
+    rows, before, endpoints, pixels, covariance = pairs
     known = np.empty(len(rows), np.int32)
     n = 0
     for i in range(len(rows)):

@@ -125,7 +125,8 @@ class Room:
         )  # fmt: skip
 
     def see(self, T_world_camera, index, rng, **kinds):
-        """(keypoints, segments, planes); a kind given as False is empty, and `share` of the points in view is detected."""
+        """(keypoints, segments, planes); a kind given as False is empty, without `depth` they are pixels alone, and `share` of the points in view
+        is detected."""
         share = kinds.get("share", 0.9)
         k = self.keypoints(T_world_camera, index, rng, share=share)
         s, p = self.segments(T_world_camera, index, rng), self.planes(T_world_camera, index, rng)
@@ -134,6 +135,10 @@ class Room:
         if not kinds.get("lines", True):
             s = replace(s, **{name: getattr(s, name)[:0] for name in ("endpoints_px", "endpoints_m", "covariance_m2", "descriptors")})
         if not kinds.get("walls", True):
+            p = self.planes(T_world_camera, index, rng, walls=())
+        if not kinds.get("depth", True):
+            k = replace(k, points_m=np.full_like(k.points_m, np.nan), sigma_m=np.full_like(k.sigma_m, np.nan))
+            s = replace(s, endpoints_m=np.full_like(s.endpoints_m, np.nan), covariance_m2=np.full_like(s.covariance_m2, np.nan))
             p = self.planes(T_world_camera, index, rng, walls=())
         return k, s, p
 

@@ -95,7 +95,7 @@ def test_a_lost_pose_hands_on_how_uncertain_it_is():
 
 def brute_force(world, now, before, step=4):
     _, segments, planes = world.features(camera_at(step), step)
-    return BruteForce()(world.frame(step).camera, now, segments, planes, before, *world.features(camera_at(0), 0)[1:])
+    return BruteForce()(world.frame(step).camera, now, segments, planes, before, *world.features(camera_at(0), 0)[1:], None)
 
 
 def test_descriptors_in_any_order_are_matched():
@@ -140,7 +140,7 @@ def test_old_features_are_not_looked_for():
     before, now = world.keypoints(camera_at(0), 0)[0], world.keypoints(camera_at(1), 11)[0]
     found = brute_force(world, now, before, step=11)
     assert len(found.keypoints) == len(found.segments) == len(found.planes) == 0
-    assert BruteForce()(world.frame(0).camera, *world.features(np.eye(4), 0), None, None, None) is None
+    assert BruteForce()(world.frame(0).camera, *world.features(np.eye(4), 0), None, None, None, None) is None
 
 
 @cache

@@ -52,7 +52,15 @@ class Run:
         rng = np.random.default_rng(self.index)
         self.tracks = self.track(frame.camera, *now, *self.before, None, None, self.tracks, rng) if tracked else None
         given = {"manhattan": self.world.manhattan(T[:3, :3], i, self.rng, **how) if manhattan else None, "tracks": self.tracks}
-        given |= {"keypoints": now[0], "segments": now[1], "planes": now[2], "previous": self.previous, "previous_pose": self.pose, "map": None}
+        given |= {
+            "camera": self.world.camera,
+            "keypoints": now[0],
+            "segments": now[1],
+            "planes": now[2],
+            "previous": self.previous,
+            "previous_pose": self.pose,
+            "map": None,
+        }
         wanted = type(self.plugin).__call__.__annotations__
         self.previous = self.plugin(**{name: value for name, value in given.items() if name in wanted})
         R = self.previous.R_world_camera
@@ -191,7 +199,7 @@ def test_nothing_at_all_keeps_on_turning_and_says_prediction(room):
     for plugin in (DriftFree(), ConstantVelocity(), Procrustes()):
         given = {"tracks": turning, "keypoints": replace(run.before[0], index=3), "previous": third, "previous_pose": None, "map": None}
         if not isinstance(plugin, ConstantVelocity):
-            given |= {"segments": run.before[1], "planes": run.before[2]}
+            given |= {"camera": run.world.camera, "segments": run.before[1], "planes": run.before[2]}
         found = plugin(**given, **({"manhattan": None} if isinstance(plugin, DriftFree) else {}))
         assert found.source == "prediction" and rotation_angle_deg(found.R_world_camera @ turn) < 1e-6
 

@@ -1,7 +1,7 @@
 """Sub-maps: begun when nothing is recognised for long, said in a world of their own, tied to the rest without a second copy of a wall."""
 
-import dataclasses
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +28,7 @@ AWAY = exp_se3(np.array([3.0, -1.0, 0.5, 0.1, 1.2, -0.3]))  # from the world to 
 
 
 def pose_of(T, index, status="ok", **more):
-    return dataclasses.replace(Pose(index, index * 33_000_000, T, np.eye(6) * 1e-8, T, -1, np.zeros(3, np.int32), 0, status, ""), **more)
+    return replace(Pose(index, index * 33_000_000, T, np.eye(6) * 1e-8, T, -1, np.zeros(3, np.int32), 0, status, ""), **more)
 
 
 def seen(world, map, index, step, T, **more):
@@ -86,7 +86,7 @@ def test_a_sub_map_is_merged_where_the_camera_is_recognised(both):
 def test_a_sub_map_is_merged_by_the_third_keyframe_that_is_recognised(both):
     """The first two only propose it."""
     world, map = both
-    stage, older = dataclasses.replace(EVERY, verified_by=3), map.keyframes.row("T_world_camera", 5)
+    stage, older = replace(EVERY, verified_by=3), map.keyframes.row("T_world_camera", 5)
     for index, step in ((12, 33), (17, 36), (22, 39)):
         T = camera_at(step)
         recognised = pose_of(T, index, "degraded", reference=5, T_reference_camera=invert(older) @ T)
@@ -104,11 +104,11 @@ def test_a_merge_is_undone_by_keeping_the_sub_map_apart(both, caplog):
     merging = {"status": "degraded", "submap": 1, "reference": 11, "recognised": pose_of(camera_at(33), 12, "degraded", submap=0)}
     merged = seen(world, map, 12, 33, AWAY @ camera_at(33), **merging)
     assert caplog.messages == ["map: sub-map 1 is merged with 0 at frame 12; map.apart=[1] undoes it"]
-    apart = seen(world, map, 12, 33, AWAY @ camera_at(33), stage=dataclasses.replace(EVERY, apart=(1,)), **merging)
+    apart = seen(world, map, 12, 33, AWAY @ camera_at(33), stage=replace(EVERY, apart=(1,)), **merging)
     assert not merged.keyframes.column("submap").any() and apart.keyframes.column("submap").tolist() == [0] * 6 + [1] * 7
     assert np.allclose(apart.keyframes.column("T_world_camera")[12], AWAY @ camera_at(33)) and apart.loop_closed == map.loop_closed
     assert apart.planes.column("alive").sum() == 6 and len(caplog.messages) == 1
-    other = dataclasses.replace(EVERY, apart=(2,))
+    other = replace(EVERY, apart=(2,))
     assert not seen(world, map, 12, 33, AWAY @ camera_at(33), stage=other, **merging).keyframes.column("submap").any()
 
 
@@ -128,28 +128,37 @@ def test_frames_of_a_sub_map_count_once_it_is_merged(both):
     _, map = both
     poses = [pose_of(camera_at(0), 0, reference=0), pose_of(AWAY, 20, "degraded", submap=1, reference=8), pose_of(AWAY, 21, "lost", reference=8)]
     assert [is_merged(pose, map) for pose in poses] == [True, False, False] and len(final_trajectory(Result(Poses(poses), map))) == 1
-    tied = dataclasses.replace(map, keyframes=map.keyframes.updated(np.arange(6, 12), submap=np.zeros(6, np.int32)))
+    tied = replace(map, keyframes=map.keyframes.updated(np.arange(6, 12), submap=np.zeros(6, np.int32)))
     assert [is_merged(pose, tied) for pose in poses] == [True, True, False] and len(final_trajectory(Result(Poses(poses), tied))) == 2
 
 
 def test_a_new_sub_map_begins_after_as_many_frames_as_were_sought_in_vain():
-    """Fifteen frames whose tracks are good and whose place is not known; a frame without tracks, or without a search, does not count."""
+    """Fifteen frames whose tracks are good and whose place is not known; one without tracks, without a search, or without depth, does not count."""
     world, other = World(), World(seed=5)
     map = seen(other, None, 0, 0, np.eye(4))
     pose, stage = pose_of(np.eye(4), 0, "lost", reference=0), Refine(submap_after=15)
     statuses = []
     for index in range(1, 20):
         T, features = camera_at(index), world.features(camera_at(index), index)
+        features = without_depth(*features) if index == 6 else features
         translation = translation_of(T, index, estimated=index != 4)
         matches = LocalMap()(world.frame(index).camera, rotation_of(T, index), translation, *features, map, None)
-        sought = dataclasses.replace(pose, index=index) if index != 5 else None
+        sought = replace(pose, index=index) if index != 5 else None
         pose = stage(world.frame(index).camera, rotation_of(T, index), translation, None, matches, *features, pose, map, sought)
         statuses.append((pose.status, pose.submap))
         if pose.submap:
             break
-    assert statuses == [("lost", 0)] * 16 + [("degraded", 1)]
+    assert statuses == [("lost", 0)] * 17 + [("degraded", 1)]
     assert pose.reason == "first frame of sub-map 1: relocalisation failed for 15 frames" and pose.reference == -1
     assert np.linalg.eigvalsh(pose.covariance).max() < 1e-9
+
+
+def without_depth(keypoints, segments, planes):
+    """Features of a frame in whose image nothing has depth."""
+    nowhere = np.full_like(keypoints.points_m, np.nan), np.full_like(segments.endpoints_m, np.nan)
+    none = {name: getattr(planes, name)[:0] for name in ("coefficients", "covariance", "moments", "pixels", "samples_m")}
+    none["labels"] = np.zeros_like(planes.labels)
+    return replace(keypoints, points_m=nowhere[0]), replace(segments, endpoints_m=nowhere[1]), replace(planes, **none)
 
 
 def test_what_was_mapped_since_a_loss_is_split_off_with_landmarks_of_its_own():
@@ -167,4 +176,4 @@ def test_what_was_mapped_since_a_loss_is_split_off_with_landmarks_of_its_own():
     for submap in (0, 1):
         seen_by = local_window(split, camera_at(0), 2, 10, 3, submap=submap).points
         assert len(seen_by) and ((split.points.rows("first", seen_by) >= 3) == bool(submap)).all()
-    assert split_submap(map, dataclasses.replace(pose, reference=0)) is map  # relative to a keyframe of the rest
+    assert split_submap(map, replace(pose, reference=0)) is map  # relative to a keyframe of the rest

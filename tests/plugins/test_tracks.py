@@ -162,15 +162,16 @@ def test_points_without_depth_in_one_of_the_frames(room):
     assert not np.isnan(neither.points_m).any() and len(neither.keypoints) > 60
 
 
-def test_motion_covariance_is_realistic(room):
+@pytest.mark.parametrize("with_depth", [True, False])
+def test_motion_covariance_is_realistic(room, with_depth):
     errors = []
     for seed in range(60):
         world, rng = room(seed), np.random.default_rng(seed)
         T = pose(rng.normal(0, 0.5, 3), rng.normal(0, 0.01, 3))
         kinds = [{}, {"points": False}, {"lines": False}][seed % 3]
-        before, now = world.see(START, 0, rng, **kinds), world.see(T, 1, rng, **kinds)
+        before, now = world.see(START, 0, rng, **kinds), world.see(T, 1, rng, depth=with_depth, **kinds)
         found = track(world, now, before)
-        motion = solve_motion(Projection(angle_px=0.001, plane_floor_deg=0.01), found, *now, 1)
+        motion = solve_motion(Projection(angle_px=0.001, plane_floor_deg=0.01), world.camera, found, *now, 1)
         truth = invert(T)
         e = np.concatenate([_vector(truth[:3, :3] @ motion.R.T), truth[:3, 3] - motion.t])
         errors.append(e @ np.linalg.solve(motion.covariance, e) / 6.0)
@@ -181,13 +182,31 @@ def _vector(R):
     return 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
 
 
+def test_frames_without_depth_continue_the_tracks(room):
+    """Two of four frames: the motion to each is measured, and so is that to the frame whose depth is back, as well as from frame to frame."""
+    world, rng = room(), np.random.default_rng(11)
+    poses = [pose(np.multiply(i, [0.4, -0.5, 0.2]), np.multiply(i, [0.01, -0.01, 0.02])) for i in range(4)]
+    seen = [world.see(T, i, rng, depth=i in (0, 3)) for i, T in enumerate(poses)]
+    tracks = None
+    for i in range(1, 4):
+        tracks = track(world, seen[i], seen[i - 1], previous=tracks)
+        true = invert(poses[i]) @ poses[i - 1]
+        motion = solve_motion(Projection(), world.camera, tracks, *seen[i], 1)
+        assert right(seen[i], seen[i - 1], tracks) == 1.0 and len(tracks.keypoints) > 120 and len(tracks.segments) > 15
+        assert rotation_angle_deg(motion.R.T @ true[:3, :3]) < 0.1 and np.linalg.norm(motion.t - true[:3, 3]) < 0.006
+    carried = np.isfinite(tracks.points_m[:, 2])
+    shown = world.camera.back_project(seen[2][0].pixels[tracks.keypoints[:, 0]], tracks.points_m[:, 2])
+    assert carried.sum() > 120 and np.allclose(tracks.points_m, shown, atol=1e-5, equal_nan=True)  # on the ray of the pixel
+    assert (tracks.sigma_m[carried] > seen[0][0].sigma_m.min()).all()
+
+
 def test_motion_without_terms_is_the_prediction_with_the_prior(room):
     none = Tracks(
         1, 1, 0, np.zeros((0, 2), np.int32), np.zeros((0, 3), np.float32), np.zeros(0, np.float32), np.zeros((0, 2), np.int32),
         np.zeros((0, 2, 3), np.float32), np.zeros((0, 2), np.int32), np.zeros((0, 4)), np.zeros((0, 3, 3)), exp_so3(np.array([0.1, 0.0, 0.0])),
     )  # fmt: skip
     world, rng = room(), np.random.default_rng(7)
-    motion = solve_motion(Projection(), none, *world.see(START, 1, rng), 1)
+    motion = solve_motion(Projection(), world.camera, none, *world.see(START, 1, rng), 1)
     assert np.allclose(motion.R, exp_so3(np.array([0.1, 0.0, 0.0]))) and np.allclose(motion.t, 0.0) and motion.support == 0.0
     assert np.allclose(np.sqrt(np.diag(motion.covariance)), np.repeat([np.radians(2.0), 0.1], 3))
 
