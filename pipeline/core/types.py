@@ -235,7 +235,8 @@ class ManhattanFrame(Value):
 class Tracks(Value):
     """Features of this frame found in the previous one. Pairs are rows (previous, current).
 
-    The previous geometry is copied, in the previous camera frame, so that motion can be solved from Tracks and the current features alone.
+    The previous geometry is copied, in the previous camera frame, so that motion can be solved from Tracks and the current features alone. Of a
+    previous frame without any depth it is that of the frame before, moved as its features moved.
     `R_current_previous` is the rotation that predicted the search, corrected by the pairs found. `repeated` is the share of the pairs of key points
     whose pixel and descriptor are bit-identical in both images: hardly any, but most of them where colour repeats, wholly or in part."""
 

@@ -52,8 +52,9 @@ class StructureGates:
 
 
 def with_carried_depth(before: Features, tracks: Tracks | None, options: MotionOptions, camera: Camera) -> Features:
-    """Give the key points and lines of a previous frame without any depth the positions of those that its `tracks` found them to be, moved as these
-    have. So a frame that comes without depth, or several in a row, does not interrupt the tracks."""
+    """Return the features of a previous frame; those of one without any depth at the positions that its `tracks` have in the frame before, moved by
+    the motion of these tracks: key points on the rays of their pixels, lines where their ends come to. So frames without depth, one or several in a
+    row, do not interrupt tracking."""
     points, lines = before.keypoints, before.segments
     if tracks is None or tracks.index != points.index or np.isfinite(points.points_m[:, 2]).any():
         return before
