@@ -100,8 +100,9 @@ def test_every_rotation_is_one(room, name, data):
     kinds = {kind: draw(kind, True, False) for kind in ("points", "lines", "walls")}
     before, now = two.seen(np.eye(4), 0, kinds), two.seen(two.camera, 1, kinds)
     first = called(
-        plugin, manhattan=two.world.manhattan(np.eye(3), 0, two.rng) if draw("first", True, False) else None, tracks=None, keypoints=before[0],
-        segments=before[1], planes=before[2], previous=None, previous_pose=None, map=None, rng=np.random.default_rng(0),
+        plugin, camera=two.world.camera, manhattan=two.world.manhattan(np.eye(3), 0, two.rng) if draw("first", True, False) else None,
+        tracks=None, keypoints=before[0], segments=before[1], planes=before[2],
+        previous=None, previous_pose=None, map=None, rng=np.random.default_rng(0),
     )  # fmt: skip
     check(first)
     share, what = draw("share", 0.0, 0.3, 1.0), draw("with", np.nan, np.inf, 0.0)
@@ -120,7 +121,7 @@ def test_every_rotation_is_one(room, name, data):
         index, status = draw("pose index", 0, -3), draw("status", OK, DEGRADED, LOST)
         pose = Pose(index, 0, np.eye(4), spread, np.eye(4), -1, np.zeros(3, np.int32), 0, status, "")
     found = called(
-        plugin, manhattan=manhattan_value if manhattan is not None else None, tracks=tracks,
+        plugin, camera=two.world.camera, manhattan=manhattan_value if manhattan is not None else None, tracks=tracks,
         keypoints=two.broken(now[0], share, what, "points_m", "sigma_m"),
         segments=two.broken(now[1], share, what, "endpoints_m", "covariance_m2"),
         planes=two.broken(now[2], share, draw("planes with", 0.0, 1.0), "covariance"),
