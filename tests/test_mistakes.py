@@ -129,7 +129,7 @@ def test_a_mistake_is_one_line(here, monkeypatch, capsys, words, code, line):
     assert sorted(path.name for path in here.iterdir()) == FILES  # a refused run leaves no folder behind
 
 
-def test_depth_in_fifths_of_millimetres_taken_for_metres_is_named_and_loses_the_frames(tmp_path, capsys):
+def test_depth_in_fifths_of_millimetres_taken_for_metres_is_named_and_the_run_refused(tmp_path, capsys):
     room = th.dataset.synthetic(width=160, height=120, length=8)
     camera = room(0).camera
     for folder, image in (("rgb", lambda frame: frame.color), ("depth", lambda frame: np.rint(5000 * frame.depth_m).astype(np.uint16))):
@@ -140,11 +140,12 @@ def test_depth_in_fifths_of_millimetres_taken_for_metres_is_named_and_loses_the_
     (tmp_path / "camera.yaml").write_text("".join(f"{name}: {value}\n" for name, value in numbers.items()))
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # of NumPy
-        assert main(["run", str(tmp_path), f"out={tmp_path}/run"]) == 0
+        assert main(["run", str(tmp_path), f"out={tmp_path}/run"]) == 1
     printed = capsys.readouterr()
     assert "millimetres taken for metres; give a depth_scale 1000 times as large" in printed.err
-    assert "are beyond 1000 m and count as missing; is the depth_scale of the camera right?\n" in printed.err.splitlines(True)[-1]
-    assert "frames: 1 ok, 7 lost\n" in printed.out
+    assert "are beyond 1000 m and count as missing; is the depth_scale of the camera right?\n" in printed.err
+    assert printed.err.endswith("trihedron: dataset: none of 8 frames has depth; check its images, and the depth_scale of its camera\n")
+    assert not (tmp_path / "run").exists()
 
 
 def test_the_table_is_long_enough():

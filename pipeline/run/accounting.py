@@ -63,8 +63,8 @@ class Accounting:
         if stage == "pose":
             times.latency_ms = 1e3 * (ended_s - (began_s if times.handed_over_s is None else times.handed_over_s))
 
-    def take(self, position: int, index: int, values: Mapping[str, Any], count: int, late: bool) -> bool:
-        """Add the values of a frame to the result; False where the frame cannot be read. `late` frames do not count as unreadable.
+    def take(self, position: int, index: int, values: Mapping[str, Any], count: int, left_out: bool) -> bool:
+        """Add the values of a frame to the result; False where the frame cannot be read. Frames that were `left_out` do not count as unreadable.
 
         Raises DataError when too many of `count` frames cannot be read."""
         if not values:  # the data set failed
@@ -73,7 +73,7 @@ class Accounting:
         for name, ms in times.calls_ms.items():
             self.timing.add_call(name, ms)
         if "dataset" in values and values["dataset"] is None:
-            self._skip(count, late)
+            self._skip(count, left_out)
             return False
         times.latency_ms = sum(times.calls_ms.values()) if times.latency_ms is None else times.latency_ms
         self.timing.add_frame(times.latency_ms)
@@ -88,8 +88,8 @@ class Accounting:
             self.result.map = latest
         return True
 
-    def _skip(self, count: int, late: bool) -> None:
-        self.result.unreadable += not late
+    def _skip(self, count: int, left_out: bool) -> None:
+        self.result.unreadable += not left_out
         if self.result.unreadable > UNREADABLE_SHARE * count:
             cause = f"{self.result.unreadable} of {count} frames cannot be read"
             raise DataError("dataset", cause, "see the warnings above for the first file; the data set is damaged")

@@ -18,11 +18,13 @@ log = logging.getLogger("trihedron")
 LATE_NS = 1_000_000_000  # a frame that comes this late or later was not late: the clock was set back
 CONSTANT = 0.95  # share of the readings with one value, from which an image of depth counts as constant
 CONSTANT_READINGS = 0.01  # of the image, without which nothing is constant
-STALE_NS = 50_000_000  # age from which a repeated image is wrong: a Kinect repeats single images at 30 a second
+STALE_NS = 50_000_000  # age from which repeated colour is wrong, and repeated depth a fault: a Kinect repeats single images at 30 a second
 RATE_IMAGES = 4  # in a row that each repeat equally often, which shows a slower stream: a Kinect repeats single images here and there
 CHANGED_LEVELS, CHANGED_SIGMAS = 16, 7.0  # grey levels, and standard deviations of depth, beyond the noise of an image
 CHANGED_SHARE = 0.02  # of the pixels, by which an image has changed
 SATURATED, CROWDED = 0.02, 3.0  # a limit: share of the image that has this value, and times the readings of any other depth
+LEAST_DEPTH = 0.01  # of the image, with which a run can begin
+DARK_NS = 1_000_000_000  # for which black colour at the beginning is that of a camera that starts, not of a dark room
 AWAY_S = 0.5  # to a frame that shows surfaces at other distances
 JUDGED = 10  # readable frames after which the scale of depth is judged
 SAMPLED_PX = 8  # apart are the readings by which scale and limit are judged
@@ -103,21 +105,21 @@ class FrozenStream:
     """Detects one stream, depth or colour, that stands still, bit-identical frame after frame, while the other goes on; and one that is slower.
 
     The other is compared with that of the first frame with this image: the change adds up while the camera moves. A camera at rest shows no change
-    beyond its noise. An image that is repeated for less than `STALE_NS` is late, not a fault, unless all are repeated equally often.
+    beyond its noise. An image that is repeated for less than `stale_ns` is late, not a fault, unless all are repeated equally often.
 
     `period` is the number of frames from one new image to the next where that is regular, 1 before it is known to be; `undecided` while nothing but
     repeated images came, too few to know."""
 
-    def __init__(self, image: Callable[[Frame], F32 | U8], has_moved: Callable[[Frame, Frame], bool]) -> None:
-        self._image, self._has_moved = image, has_moved
+    def __init__(self, image: Callable[[Frame], F32 | U8], has_moved: Callable[[Frame, Frame], bool], stale_ns: int) -> None:
+        self._image, self._has_moved, self._stale_ns = image, has_moved, stale_ns
         self._first: Frame | None = None
         self._length, self._moved = 0, False  # frames with the present image, and whether the other has changed meanwhile
         self._lengths: list[int] = []  # of the images before it, the first of all left out, whose beginning was not seen
         self._images = 0
         self.period, self.undecided = 1, True
 
-    def since(self, frame: Frame) -> int | None:
-        """Return the number of the first frame with the image of this one, if that is stale and the other image has changed since; else None."""
+    def since(self, frame: Frame) -> Frame | None:
+        """Return the first frame with the image of this one, if that is stale and the other image has changed since; else None."""
         first = self._first
         if first is None or not _bit_identical(self._image(first), self._image(frame)):
             self._count_image()
@@ -128,7 +130,7 @@ class FrozenStream:
         self.undecided = self.undecided and age_ns < LATE_NS
         moved = bool(self._image(frame).any()) and self._has_moved(first, frame)
         self._moved |= moved
-        return first.index if moved and (age_ns >= STALE_NS or self.period > 1) else None
+        return first if moved and (age_ns >= self._stale_ns or self.period > 1) else None
 
     def known_rate(self) -> bool:
         """Return True where the stream is known to be slower and the present image is repeated no longer than that and a missed one explain."""
@@ -165,13 +167,22 @@ def _bit_identical(a: F32 | U8, b: F32 | U8) -> bool:
     return np.array_equal(a[row : row + 1], b[row : row + 1]) and np.array_equal(a, b)
 
 
+def _missing(frame: Frame, age_ns: int) -> str:
+    """Return what a run cannot begin without and the frame does not have: depth, or, in the first second, colour; "" for a frame that has both."""
+    if np.count_nonzero(frame.depth_m) < LEAST_DEPTH * frame.depth_m.size:
+        return "depth"
+    return "" if age_ns >= DARK_NS or frame.color.any() else "colour"
+
+
 def _sampled_gray(frame: Frame) -> F32:
     return np.asarray(frame.color[::SAMPLED_PX, ::SAMPLED_PX].mean(axis=2, dtype=np.float32))
 
 
 class FrameValidation:
     """Reads frames in their order. Frames in `known` have the stamps they were recorded with; `count` frames can be read at any time (0: those of a
-    camera, which come once). `late` are the positions of frames that were skipped because later ones had come before them."""
+    camera, which come once). A run begins with the first frame that shows something: a map that began without depth would have no landmarks.
+
+    `left_out` are the positions of frames that can be read and were skipped: later ones had come before them, or nothing had been shown yet."""
 
     def __init__(self, known: Mapping[int, int], count: int) -> None:
         self._known, self._count = known, count
@@ -179,13 +190,17 @@ class FrameValidation:
         self._set_back_ns = 0
         self._medians_m: list[float] = []
         self._gaps: list[float] = []
-        self._frozen_depth = FrozenStream(lambda frame: frame.depth_m, color_has_changed)
-        self._frozen_color = FrozenStream(lambda frame: frame.color, depth_has_changed)
+        self._frozen_depth = FrozenStream(lambda frame: frame.depth_m, color_has_changed, 0)
+        self._frozen_color = FrozenStream(lambda frame: frame.color, depth_has_changed, STALE_NS)
         self._depth_is_slower = False
         self._frozen: list[tuple[int, int]] = []  # frames with depth that is not new, and whose it is: to be warned of unless it is the rate of depth
         self._registration = RegistrationCheck()
         self._camera: Camera | None = None  # the latest that was found without a fault: nearly always that of all frames
-        self.late: set[int] = set()
+        self._first_ns: int | None = None
+        self._missing: str | None = (
+            "" if known else None
+        )  # from the latest frame, until one had all; those before known ones may have shown something
+        self.left_out: set[int] = set()
 
     def __call__(self, position: int, read: Callable[[int], Any], index: Callable[[], int]) -> Any:
         """Return the frame that `read` finds at a position, validated, or None; `index` is its number. An error of the first frame is one of the
@@ -205,7 +220,24 @@ class FrameValidation:
             return frame
         timed = self._in_time(position, frame)
         valid = self._without_faulty_depth(position, self._without_frozen_color(usable(timed))) if timed is not None else None
-        return without_limit(valid, lambda fps: self._elsewhere(position, read, fps))
+        valid = without_limit(valid, lambda fps: self._elsewhere(position, read, fps))
+        return valid if valid is not None and self._begins(position, valid) else None
+
+    def _begins(self, position: int, frame: Frame) -> bool:
+        """Return True for a frame that shows something and for those after it; else the frame is left out."""
+        self._first_ns = frame.stamp_ns if self._first_ns is None else self._first_ns
+        self._missing = "" if self._missing == "" else _missing(frame, frame.stamp_ns - self._first_ns)
+        if self._missing:
+            log.warning("frame %d: it has no %s, nor has any before it; it is skipped", frame.index, self._missing)
+            self.left_out.add(position)
+        return not self._missing
+
+    def check_begun(self) -> None:
+        """Raise DataError where every frame was skipped because nothing was shown."""
+        if self.left_out and self._missing:
+            raise DataError(
+                "dataset", f"none of {len(self.left_out)} frames has {self._missing}", "check its images, and the depth_scale of its camera"
+            )
 
     def _without_faulty_depth(self, position: int, frame: Frame | None) -> Frame | None:
         """Return the frame without its depth where that is constant (saturated, for one) or frozen: whatever is tracked by it is wrong."""
@@ -214,8 +246,8 @@ class FrameValidation:
         since, constant = self._frozen_depth.since(frame), constant_share(frame.depth_m)
         self._judge_depth_rate(frame)
         if since is not None:
-            if not self._frozen_depth.known_rate():
-                self._frozen.append((frame.index, since))
+            if not self._frozen_depth.known_rate() and frame.stamp_ns - since.stamp_ns >= STALE_NS:
+                self._frozen.append((frame.index, since.index))
         elif constant >= CONSTANT:
             log.warning("frame %d: %.0f %% of its depth readings are equal; they count as missing", frame.index, 100 * constant)
         if not self._frozen_depth.undecided or position + 1 == self._count:
@@ -247,7 +279,7 @@ class FrameValidation:
         since = None if frame is None else self._frozen_color.since(frame)
         if frame is None or since is None:
             return frame
-        log.warning("frame %d: its colour is that of frame %d, bit for bit, while depth has changed; it counts as missing", frame.index, since)
+        log.warning("frame %d: its colour is that of frame %d, bit for bit, while depth has changed; it counts as missing", frame.index, since.index)
         return replace(frame, color=np.zeros_like(frame.color))
 
     def _elsewhere(self, position: int, read: Callable[[int], Any], fps: float) -> Any:
@@ -265,7 +297,7 @@ class FrameValidation:
             late_ns = self._last_ns - stamp_ns
             if late_ns < LATE_NS:
                 log.warning("frame %d: its time is %.0f ms before that of the frame before it; it is skipped", frame.index, late_ns / 1e6)
-                self.late.add(position)
+                self.left_out.add(position)
                 return None
             log.warning("frame %d: the clock was set back by %.3f s; time goes on from the frame before", frame.index, late_ns / 1e9)
             period_ns = round(1e9 / frame.camera.fps)

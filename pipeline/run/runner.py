@@ -145,7 +145,7 @@ class Runner:
         """Account for a finished frame and record it."""
         index, accounts = self.indices[position], self.accounts
         self.state.append(index, values)
-        if accounts.take(position, index, values, self.count, position in self.validation.late):
+        if accounts.take(position, index, values, self.count, position in self.validation.left_out):
             self._judge_time_offset(values.get("dataset"), values.get("pose"))
             if self.budgeted is not None:
                 level = self.budgeted.take(position, index, accounts.times[position].latency_ms or 0.0)
@@ -258,7 +258,9 @@ class Runner:
             check_together(arguments, self._sources, topics, computed)
 
     def finish(self) -> None:
-        """Take the map of a recording where none was computed and poses or folds need it, and finish the folds; after the last frame."""
+        """Take the map of a recording where none was computed and poses or folds need it, and finish the folds; after the last frame. Raises
+        DataError where no frame showed anything."""
+        self.validation.check_begun()
         if "map" not in self.computed and any(name == "pose" or self.graph.stages[name].fold for name in self.computed):
             self.result.map = self._recorded_map()
         for name in self.computed:

@@ -27,11 +27,11 @@ def validated(frames, caplog):
     return [validation(k, frames.__getitem__, lambda k=k: k) for k in range(len(frames))], caplog.messages
 
 
-def test_frozen_depth_counts_as_missing_once_it_is_stale_and_colour_has_changed(caplog):
+def test_frozen_depth_counts_as_missing_once_colour_has_changed_and_is_said_when_stale(caplog):
     still = frame(2).depth_m
     frames = [frame(k) if k < 2 else frame(k, still.copy()) for k in range(6)] + [frame(6)]
     found, warnings = validated(frames, caplog)
-    assert [bool(f.depth_m.any()) for f in found] == [True] * 4 + [False] * 2 + [True]  # frame 3 repeats it for 33 ms, as a Kinect does
+    assert has_depth(found) == "xxx...x"  # frame 3 repeats it for 33 ms, as a Kinect does: no fault, and nothing that its colour was taken with
     assert warnings == [f"frame {k}: its depth is that of frame 2, bit for bit, while colour has changed; it counts as missing" for k in (4, 5)]
     assert all(np.array_equal(f.color, given.color) for f, given in zip(found, frames))
 
@@ -71,10 +71,10 @@ def has_depth(found):
 @pytest.mark.parametrize(
     "period, period_ms, start, message",
     [
-        (2, 33.0, "x" * 10, "about 15.2 Hz instead of 30.3: only every second depth image is new"),
+        (2, 33.0, "x.x.x.x.x.", "about 15.2 Hz instead of 30.3: only every second depth image is new"),
         (2, 66.0, "x.x.x.x.x.", "about 7.58 Hz instead of 15.2: only every second depth image is new"),
-        (3, 33.0, "xx.xx.xx.xx.xx.", "about 10.1 Hz instead of 30.3: only every third depth image is new"),
-        (4, 33.0, "xx..xx..xx..xx..xx..", "about 7.58 Hz instead of 30.3: only every 4th depth image is new"),
+        (3, 33.0, "x..x..x..x..x..", "about 10.1 Hz instead of 30.3: only every third depth image is new"),
+        (4, 33.0, "x...x...x...x...x...", "about 7.58 Hz instead of 30.3: only every 4th depth image is new"),
     ],
 )
 def test_depth_slower_than_colour_is_named_once_and_an_old_image_counts_as_missing(caplog, period, period_ms, start, message):
@@ -89,7 +89,7 @@ def test_depth_slower_than_colour_is_named_once_and_an_old_image_counts_as_missi
 def test_slow_depth_that_freezes_is_named(caplog):
     """One image that was missed is none of it."""
     found, warnings = validated(slower([k - k % 2 for k in range(12)] + [10, 10, 14, 14, *[16] * 6]), caplog)
-    assert has_depth(found) == "x" * 10 + "x...x.x....."
+    assert has_depth(found) == "x.x.x.x.x." + "x...x.x....."
     assert warnings[1:] == [
         f"frame {k}: its depth is that of frame 16, bit for bit, while colour has changed; it counts as missing" for k in (20, 21)
     ]
@@ -118,6 +118,26 @@ def test_a_slow_change_adds_up(caplog):
     depth = frame(0).depth_m
     found, _ = validated([frame(k, depth, np.full((120, 160, 3), 60 + 3 * k, np.uint8)) for k in range(9)], caplog)
     assert [k for k, f in enumerate(found) if not f.depth_m.any()] == [6, 7, 8]
+
+
+@pytest.mark.parametrize("missing", ["depth", "colour"])
+def test_a_run_begins_with_the_first_frame_that_shows_something(caplog, missing):
+    """Three frames without depth, or black ones, at the beginning are skipped; one in mid-run is not."""
+    without = {"depth": {"depth": np.zeros((120, 160), np.float32)}, "colour": {"color": np.zeros((120, 160, 3), np.uint8)}}[missing]
+    found, warnings = validated([frame(k, **without) if k in (0, 1, 2, 5) else frame(k) for k in range(7)], caplog)
+    assert [k for k, f in enumerate(found) if f is not None] == [3, 4, 5, 6]
+    assert warnings == [f"frame {k}: it has no {missing}, nor has any before it; it is skipped" for k in range(3)]
+
+
+def test_a_dark_room_begins_after_a_second(caplog):
+    found, warnings = validated([frame(k, color=np.zeros((120, 160, 3), np.uint8), period_ms=250) for k in range(6)], caplog)
+    assert [k for k, f in enumerate(found) if f is not None] == [4, 5] and len(warnings) == 4
+
+
+def test_a_recorded_frame_without_depth_is_replayed():
+    """The frames before it, which had depth, are not those of the replay."""
+    given = frame(7, np.zeros((120, 160), np.float32))
+    assert FrameValidation({7: given.stamp_ns}, 1)(0, lambda position: given, lambda: 7) is given
 
 
 @pytest.mark.parametrize("value", [65.535, 1.0])

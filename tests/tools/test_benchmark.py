@@ -76,7 +76,7 @@ def test_every_layout_of_a_folder_is_measured(tmp_path, capsys):
         (tmp_path / name).mkdir()
     for k in range(3):
         cv2.imwrite(str(tmp_path / "rgb" / f"{k}.png"), rng.integers(0, 256, (48, 64, 3), dtype=np.uint8))
-        cv2.imwrite(str(tmp_path / "depth" / f"{k}.png"), np.full((48, 64), 2000, np.uint16))
+        cv2.imwrite(str(tmp_path / "depth" / f"{k}.png"), np.tile(np.arange(2000, 2064, dtype=np.uint16), (48, 1)))
     (tmp_path / "camera.yaml").write_text("{width: 64, height: 48, fx: 60, fy: 60, cx: 31.5, cy: 23.5, depth_scale: 1000}\n")
     assert main(["benchmark", str(tmp_path), "outputs=[normals]", "record.topics=[]", "--one-core"]) == 0
     printed = capsys.readouterr().out
