@@ -165,6 +165,14 @@ def test_a_run_begins_with_the_first_frame_that_shows_something(tmp_path, capsys
     assert [pose.index for pose in poses] == [*range(10, 30)] and sum(pose.status == OK for pose in poses) >= 19
 
 
+def test_colour_at_half_the_rate_of_depth_is_tracked_at_its_rate(tmp_path, capsys):
+    """As of a camera in the dark: frames with repeated colour are skipped."""
+    case = Case({"color_every": 2}, {"length": 40}, said="colour is slower than depth, about 15 Hz instead of 30")
+    poses, true, said, keyframes = run(tmp_path, capsys, case)
+    check(case, poses, true, said, keyframes)
+    assert [pose.index for pose in poses] == [*range(0, 40, 2)] and all(pose.status == OK for pose in poses)
+
+
 def test_frames_that_come_late_again_or_not_at_all(tmp_path, capsys):
     case = Case({"drop": "6:8", "reverse": "12:15", "jump": 20, "jump_s": -10.0, "freeze": "24:27"}, {"length": 34}, said="the clock was set back by")
     poses, true, said, keyframes = run(tmp_path, capsys, case)

@@ -82,6 +82,7 @@ class Faults:
     join: NonNegativeInt = 0  # frame from which on the images are of another recording; 0 = none
     joined: dict[str, Any] = field(default_factory=dict)  # options of that where they differ: +dataset.joined.seed=1
     depth_every: PositiveInt = 1  # only one depth image in so many is new, the next repeat it: 2 makes depth at 15 Hz of 30
+    color_every: PositiveInt = 1  # the same of colour
 
     def __post_init__(self) -> None:
         if self.of == "faults" or "frames" in {**self.options, **self.joined}:
@@ -106,6 +107,8 @@ class Faults:
             shown, frame = number, replace(timed, color=color, depth_m=depth)
         if number % self.depth_every and (slow := self._inner(number - number % self.depth_every)) is not None:
             frame = replace(frame, depth_m=slow.depth_m)
+        if number % self.color_every and (slow := self._inner(number - number % self.color_every)) is not None:
+            frame = replace(frame, color=slow.color)
         color, depth, camera = self._cover_images(number, *self._spoilt(shown, frame))
         return Frame(arrived, self._delivery.stamp_ns(timed.stamp_ns, number), color, depth, replace(camera, sigmas=CalibrationSigmas()))
 

@@ -10,18 +10,15 @@ from typing import Any
 import numpy as np
 
 from trihedron.pipeline.core.errors import DataError
-from trihedron.pipeline.core.types import F32, U8, Camera, Frame
+from trihedron.pipeline.core.types import F32, Camera, Frame
 from trihedron.pipeline.core.value_checks import camera_fault
+from trihedron.pipeline.run.frozen_stream import CHANGED_SHARE, COLOR, DEPTH, LATE_SHARE, STALE_NS, FrozenStream, age_ns
 from trihedron.pipeline.run.registration_check import RegistrationCheck
 
 log = logging.getLogger("trihedron")
 LATE_NS = 1_000_000_000  # a frame that comes this late or later was not late: the clock was set back
 CONSTANT = 0.95  # share of the readings with one value, from which an image of depth counts as constant
 CONSTANT_READINGS = 0.01  # of the image, without which nothing is constant
-STALE_NS = 50_000_000  # age from which repeated colour is wrong, and repeated depth a fault: a Kinect repeats single images at 30 a second
-RATE_IMAGES = 4  # in a row that each repeat equally often, which shows a slower stream: a Kinect repeats single images here and there
-CHANGED_LEVELS, CHANGED_SIGMAS = 16, 7.0  # grey levels, and standard deviations of depth, beyond the noise of an image
-CHANGED_SHARE = 0.02  # of the pixels, by which an image has changed
 SATURATED, CROWDED = 0.02, 3.0  # a limit: share of the image that has this value, and times the readings of any other depth
 LEAST_DEPTH = 0.01  # of the image, with which a run can begin
 DARK_NS = 1_000_000_000  # for which black colour at the beginning is that of a camera that starts, not of a dark room
@@ -34,6 +31,7 @@ OFF_CENTRE = 0.15  # of width or height: farther from the centre no camera has i
 GAPS = 5  # between frames, whose median is judged, in periods of the camera
 UNITS = ((1e7, "nanoseconds"), (1e4, "microseconds"), (3e2, "milliseconds"))  # periods, from which stamps in this unit were taken for seconds
 TINY_GAP = 1e-7  # periods: seconds were taken for nanoseconds
+MISSING, SKIPPED = "it counts as missing", "the frame is skipped"
 NEAR_M, FAR_M = 0.7, 8.0  # half of the readings nearer, or farther: no room of a house is seen like that (a Kinect measures 0.4 to 8 m)
 
 
@@ -101,81 +99,11 @@ def constant_share(depth_m: F32) -> float:
     return float(np.count_nonzero(readings == np.partition(readings, middle)[middle]) / readings.size)
 
 
-class FrozenStream:
-    """Detects one stream, depth or colour, that stands still, bit-identical frame after frame, while the other goes on; and one that is slower.
-
-    The other is compared with that of the first frame with this image: the change adds up while the camera moves. A camera at rest shows no change
-    beyond its noise. An image that is repeated for less than `stale_ns` is late, not a fault, unless all are repeated equally often.
-
-    `period` is the number of frames from one new image to the next where that is regular, 1 before it is known to be; `undecided` while nothing but
-    repeated images came, too few to know."""
-
-    def __init__(self, image: Callable[[Frame], F32 | U8], has_moved: Callable[[Frame, Frame], bool], stale_ns: int) -> None:
-        self._image, self._has_moved, self._stale_ns = image, has_moved, stale_ns
-        self._first: Frame | None = None
-        self._length, self._moved = 0, False  # frames with the present image, and whether the other has changed meanwhile
-        self._lengths: list[int] = []  # of the images before it, the first of all left out, whose beginning was not seen
-        self._images = 0
-        self.period, self.undecided = 1, True
-
-    def since(self, frame: Frame) -> Frame | None:
-        """Return the first frame with the image of this one, if that is stale and the other image has changed since; else None."""
-        first = self._first
-        if first is None or not _bit_identical(self._image(first), self._image(frame)):
-            self._count_image()
-            self._first, self._length, self._moved = frame, 1, False
-            return None
-        self._length += 1
-        age_ns = frame.stamp_ns - first.stamp_ns
-        self.undecided = self.undecided and age_ns < LATE_NS
-        moved = bool(self._image(frame).any()) and self._has_moved(first, frame)
-        self._moved |= moved
-        return first if moved and (age_ns >= self._stale_ns or self.period > 1) else None
-
-    def known_rate(self) -> bool:
-        """Return True where the stream is known to be slower and the present image is repeated no longer than that and a missed one explain."""
-        return self.period > 1 and self._length <= 2 * self.period
-
-    def _count_image(self) -> None:
-        """Count how often an image came, when the next comes. One that is repeated while nothing changes shows nothing."""
-        self._images += self._first is not None
-        if self.period > 1 or self._images < 2 or (self._length > 1 and not self._moved):
-            return
-        self._lengths = [*self._lengths, self._length][-RATE_IMAGES:]
-        regular = len(set(self._lengths)) == 1
-        if regular and self._length > 1 and len(self._lengths) == RATE_IMAGES:
-            self.period = self._length
-        self.undecided = self.undecided and regular and self._length > 1 and self.period == 1
-
-
-def color_has_changed(a: Frame, b: Frame) -> bool:
-    """Compare the colour of two frames beyond image noise."""
-    return bool((np.abs(_sampled_gray(b) - _sampled_gray(a)) > CHANGED_LEVELS).mean() >= CHANGED_SHARE)
-
-
-def depth_has_changed(a: Frame, b: Frame) -> bool:
-    """Compare the depth of two frames beyond the noise of the sensor, where both have readings."""
-    before, now = (frame.depth_m[::SAMPLED_PX, ::SAMPLED_PX] for frame in (a, b))
-    both = (before > 0.0) & (now > 0.0)
-    changed = np.abs(now - before)[both] > CHANGED_SIGMAS * b.camera.depth_noise.sigma_m(np.maximum(before, now)[both])
-    return bool(np.count_nonzero(changed) >= CHANGED_SHARE * both.size)
-
-
-def _bit_identical(a: F32 | U8, b: F32 | U8) -> bool:
-    """Compare a row first: two images that differ nearly always differ there."""
-    row = len(a) // 2
-    return np.array_equal(a[row : row + 1], b[row : row + 1]) and np.array_equal(a, b)
-
-
 def _missing(frame: Frame, age_ns: int) -> str:
     """Return what a run cannot begin without and the frame does not have: depth, or, in the first second, colour; "" for a frame that has both."""
     if np.count_nonzero(frame.depth_m) < LEAST_DEPTH * frame.depth_m.size:
         return "depth"
     return "" if age_ns >= DARK_NS or frame.color.any() else "colour"
-
-
-def _sampled_gray(frame: Frame) -> F32:
-    return np.asarray(frame.color[::SAMPLED_PX, ::SAMPLED_PX].mean(axis=2, dtype=np.float32))
 
 
 class FrameValidation:
@@ -190,10 +118,7 @@ class FrameValidation:
         self._set_back_ns = 0
         self._medians_m: list[float] = []
         self._gaps: list[float] = []
-        self._frozen_depth = FrozenStream(lambda frame: frame.depth_m, color_has_changed, 0)
-        self._frozen_color = FrozenStream(lambda frame: frame.color, depth_has_changed, STALE_NS)
-        self._depth_is_slower = False
-        self._frozen: list[tuple[int, int]] = []  # frames with depth that is not new, and whose it is: to be warned of unless it is the rate of depth
+        self._depth, self._color = FrozenStream(DEPTH), FrozenStream(COLOR)
         self._registration = RegistrationCheck()
         self._camera: Camera | None = None  # the latest that was found without a fault: nearly always that of all frames
         self._first_ns: int | None = None
@@ -219,7 +144,7 @@ class FrameValidation:
         if not isinstance(frame, Frame):
             return frame
         timed = self._in_time(position, frame)
-        valid = self._without_faulty_depth(position, self._without_frozen_color(usable(timed))) if timed is not None else None
+        valid = self._without_faulty_depth(position, self._without_frozen_color(position, usable(timed))) if timed is not None else None
         valid = without_limit(valid, lambda fps: self._elsewhere(position, read, fps))
         return valid if valid is not None and self._begins(position, valid) else None
 
@@ -243,44 +168,27 @@ class FrameValidation:
         """Return the frame without its depth where that is constant (saturated, for one) or frozen: whatever is tracked by it is wrong."""
         if frame is None:
             return None
-        since, constant = self._frozen_depth.since(frame), constant_share(frame.depth_m)
-        self._judge_depth_rate(frame)
-        if since is not None:
-            if not self._frozen_depth.known_rate() and frame.stamp_ns - since.stamp_ns >= STALE_NS:
-                self._frozen.append((frame.index, since.index))
-        elif constant >= CONSTANT:
+        since, constant = self._depth.since(frame), constant_share(frame.depth_m)
+        frozen = since is not None and self._depth.change >= CHANGED_SHARE
+        if not frozen and constant >= CONSTANT:
             log.warning("frame %d: %.0f %% of its depth readings are equal; they count as missing", frame.index, 100 * constant)
-        if not self._frozen_depth.undecided or position + 1 == self._count:
-            self._warn_of_frozen_depth()
-        if since is None and constant < CONSTANT:
-            return frame
-        return replace(frame, depth_m=np.zeros_like(frame.depth_m))
+        outcome = MISSING if frozen and age_ns(frame, since) >= STALE_NS else ""
+        self._depth.warn(frame, since, outcome, position + 1 == self._count)
+        return replace(frame, depth_m=np.zeros_like(frame.depth_m)) if frozen or constant >= CONSTANT else frame
 
-    def _warn_of_frozen_depth(self) -> None:
-        for index, since in self._frozen:
-            log.warning("frame %d: its depth is that of frame %d, bit for bit, while colour has changed; it counts as missing", index, since)
-        self._frozen.clear()
-
-    def _judge_depth_rate(self, frame: Frame) -> None:
-        """Warn, once, where depth is slower than colour; what was about to be called frozen for that is not."""
-        period, fps = self._frozen_depth.period, frame.camera.fps
-        if period == 1 or self._depth_is_slower:
-            return
-        self._depth_is_slower = True
-        self._frozen.clear()
-        log.warning(
-            "depth is slower than colour, about %.3g Hz instead of %.3g: only every %s depth image is new, a repeated one counts as missing; "
-            "record depth at the rate of colour, or take the frames with new depth alone: dataset.frames=%d::%d",
-            *(fps / period, fps, {2: "second", 3: "third"}.get(period, f"{period}th"), frame.index % period, period),
-        )
-
-    def _without_frozen_color(self, frame: Frame | None) -> Frame | None:
-        """Return the frame with black colour where that is frozen: the depth behind its key points is not theirs."""
-        since = None if frame is None else self._frozen_color.since(frame)
-        if frame is None or since is None:
-            return frame
-        log.warning("frame %d: its colour is that of frame %d, bit for bit, while depth has changed; it counts as missing", frame.index, since.index)
-        return replace(frame, color=np.zeros_like(frame.color))
+    def _without_frozen_color(self, position: int, frame: Frame | None) -> Frame | None:
+        """Return the frame with black colour where that is frozen: the depth behind its key points is not theirs. Where colour is just late, or
+        slower than depth, the frame is left out: the next one would find no key point in a black image."""
+        if frame is None:
+            return None
+        since = self._color.since(frame)
+        young = self._color.known_rate() or age_ns(frame, since) < STALE_NS
+        repeats = since is not None and self._color.change >= (LATE_SHARE if young else CHANGED_SHARE)
+        self._color.warn(frame, since, (SKIPPED if young else MISSING) if repeats else "", position + 1 == self._count)
+        if repeats and young:
+            self.left_out.add(position)
+            return None
+        return replace(frame, color=np.zeros_like(frame.color)) if repeats else frame
 
     def _elsewhere(self, position: int, read: Callable[[int], Any], fps: float) -> Any:
         """Return a frame half a second away, if it can be read."""

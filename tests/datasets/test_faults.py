@@ -87,10 +87,17 @@ def test_a_stride_is_of_the_frames_as_they_arrive_and_a_cover_of_those_underneat
     assert [bool(frame.color.any()) for frame in seen] == [True, False, True]
 
 
-def test_depth_is_slower_than_color():
-    (plain, _), faults = still_frames(0, 6), Faults("0:6", "synthetic", SMALL, depth_every=3)
-    for position, fresh in enumerate((0, 0, 0, 3, 3, 3)):
-        assert np.array_equal(faults(position).color, plain[position].color) and np.array_equal(faults(position).depth_m, plain[fresh].depth_m)
+def test_one_image_is_slower_than_the_other():
+    (plain, _), slow_depth, slow_color = (
+        still_frames(0, 6),
+        Faults("0:6", "synthetic", SMALL, depth_every=3),
+        Faults("0:6", "synthetic", SMALL, color_every=2),
+    )
+    for position, depth, color in zip(range(6), (0, 0, 0, 3, 3, 3), (0, 0, 2, 2, 4, 4)):
+        assert np.array_equal(slow_depth(position).color, plain[position].color)
+        assert np.array_equal(slow_depth(position).depth_m, plain[depth].depth_m)
+        assert np.array_equal(slow_color(position).color, plain[color].color)
+        assert np.array_equal(slow_color(position).depth_m, plain[position].depth_m)
 
 
 def test_color_is_mirrored_shuffled_or_random_and_depth_is_not():

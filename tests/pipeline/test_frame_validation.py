@@ -9,6 +9,7 @@ from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.types import Camera, Frame
 from trihedron.pipeline.run.frame_validation import FrameValidation, constant_share
 
+REPEATED = "its colour is that of frame 2, bit for bit, while depth has changed"
 CAMERA = Camera(160, 120, 130.0, 130.0, 79.5, 59.5)
 
 
@@ -40,9 +41,10 @@ def test_frozen_colour_counts_as_missing_once_it_is_stale_and_depth_has_changed(
     still = frame(2).color
     frames = [frame(k) if k < 2 else frame(k, color=still.copy()) for k in range(6)] + [frame(6)]
     found, warnings = validated(frames, caplog)
-    assert [bool(f.color.any()) for f in found] == [True] * 4 + [False] * 2 + [True]
-    assert warnings == [f"frame {k}: its colour is that of frame 2, bit for bit, while depth has changed; it counts as missing" for k in (4, 5)]
-    assert all(np.array_equal(f.depth_m, given.depth_m) for f, given in zip(found, frames))
+    assert ["-" if f is None else ".x"[bool(f.color.any())] for f in found] == [*"xxx-..x"]  # frame 3 repeats it for 33 ms, as a Kinect does
+    said = f"frame 3: {REPEATED}; the frame is skipped", *(f"frame {k}: {REPEATED}; it counts as missing" for k in (4, 5))
+    assert warnings == [*said]
+    assert all(np.array_equal(f.depth_m, given.depth_m) for f, given in zip(found, frames) if f is not None)
 
 
 def test_noise_of_depth_over_colour_without_noise_is_no_fault(caplog):
@@ -84,6 +86,34 @@ def test_depth_slower_than_colour_is_named_once_and_an_old_image_counts_as_missi
         f"depth is slower than colour, {message}, a repeated one counts as missing; "
         f"record depth at the rate of colour, or take the frames with new depth alone: dataset.frames=0::{period}"
     ]
+
+
+@pytest.mark.parametrize("period, period_ms, start", [(2, 33, "x-" * 5), (3, 33, "x-." * 5), (2, 66, "x." * 5)])
+def test_frames_that_repeat_slower_colour_are_left_out(caplog, period, period_ms, start):
+    """Until the rate is known, colour older than 50 ms counts as missing; it is said only once that this is the rate."""
+    camera = replace(CAMERA, fps=1000 / period_ms)
+    frames = [replace(frame(k, color=frame(k - k % period).color, period_ms=period_ms), camera=camera) for k in range(8 * period)]
+    found, warnings = validated(frames, caplog)
+    assert "".join("-" if f is None else ".x"[bool(f.color.any())] for f in found) == start + 3 * ("x" + (period - 1) * "-")
+    which, seen = {2: "second", 3: "third"}[period], f"about {1000 / period_ms / period:.3g} Hz instead of {1000 / period_ms:.3g}"
+    assert warnings == [
+        f"colour is slower than depth, {seen}: only every {which} colour image is new, frames that repeat one are skipped; "
+        "give more light, with which most cameras are faster, or record depth at the rate of colour"
+    ]
+
+
+def test_a_camera_at_rest_has_slower_colour_too(caplog):
+    """Depth changes by noise alone: nothing moves, and colour is still repeated."""
+    given = [frame(k, frame(0).depth_m + np.float32(1e-4 * k), frame(k - k % 2).color) for k in range(16)]
+    found, warnings = validated(given, caplog)
+    assert [k for k, f in enumerate(found) if f is None] == [11, 13, 15] and len(warnings) == 1
+
+
+def test_plain_colour_is_not_repeated(caplog):
+    """A wall without texture looks the same from everywhere."""
+    given = [frame(k, color=np.full((120, 160, 3), 128, np.uint8)) for k in range(6)]
+    found, warnings = validated(given, caplog)
+    assert found == given and warnings == []
 
 
 def test_slow_depth_that_freezes_is_named(caplog):
