@@ -21,14 +21,14 @@ from typing import Any
 import numpy as np
 import yaml
 
-from trihedron.datasets.readers.cameras import Calibration
+from trihedron.datasets.readers.cameras import NOISES, Calibration
 from trihedron.datasets.readers.registration import DepthCamera
 from trihedron.pipeline.app.calibrated_run import Recommendation
 from trihedron.pipeline.core.config import make_plugin
 from trihedron.pipeline.core.errors import DataError, TrihedronError, UsageError
 from trihedron.pipeline.core.files import write_file
 from trihedron.pipeline.core.text_table import table
-from trihedron.pipeline.core.types import EXACT_DEPTH, F64, CalibrationSigmas, Camera
+from trihedron.pipeline.core.types import F64, CalibrationSigmas, Camera, DepthNoise
 from trihedron.pipeline.record.reader import Recording
 from trihedron.tools import calibration_edges, calibration_pairs
 from trihedron.tools.arguments import Parser
@@ -283,7 +283,9 @@ def keys_of(calibration: Calibration) -> dict[str, Any]:
     keys |= {"depth_scale": calibration.depth_scale, "fps": camera.fps}
     keys |= {"distortion": list(calibration.distortion)} if calibration.distortion else {}
     keys |= {name: round(value, 6) for name in ("depth_offset", "depth_radial") if (value := getattr(calibration, name))}
-    keys |= {"depth_noise": "exact"} if camera.depth_noise == EXACT_DEPTH else {}
+    if camera.depth_noise != DepthNoise():
+        names = {noise: name for name, noise in NOISES.items()}
+        keys["depth_noise"] = names.get(camera.depth_noise) or asdict(camera.depth_noise)
     usual = asdict(CalibrationSigmas())
     if sigmas := {name: value for name, value in asdict(camera.sigmas).items() if value != usual[name]}:
         keys["sigmas"] = sigmas

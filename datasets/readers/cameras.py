@@ -23,11 +23,25 @@ SMALLEST_SCALE, LARGEST_SCALE = 1e-6, 1e9  # outside, single precision overflows
 LARGEST_COEFFICIENT = 100.0  # of a distortion; those of lenses are below 10
 LARGEST_RADIAL = 0.5
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")
-NOISES = {"kinect": DepthNoise(), "exact": EXACT_DEPTH}
+LARGEST_NOISE = 10.0  # of each coefficient: no sensor measures so badly
 NOMINAL = CalibrationSigmas()  # of a camera that nobody calibrated by itself
 # of a Kinect whose two cameras are taken to be usual ones: so far those of the TUM benchmark are from 525 px and the image's centre, root mean square
 USUAL_KINECT = CalibrationSigmas(focal=0.017, centre=0.013, depth_focal=0.017, registration=0.013)
 SHORT = "give dataset.camera=tum_fr1, tum_fr2, tum_fr3, icl_nuim or a camera.yaml"
+
+
+def stereo_noise(focal_px: float, baseline_m: float) -> DepthNoise:
+    """Return the depth noise of a stereo camera whose disparities have a standard deviation of 0.1 px: `0.1 z² / (focal_px · baseline_m)` m at z m.
+
+    Intel states 0.1 px for well textured surfaces ("Tuning depth cameras for best performance", revision 2.0, of the RealSense D415 and D435)."""
+    return DepthNoise(0.0, 0.0, 0.1 / (focal_px * baseline_m), 0.001)
+
+
+NOISES = {
+    "kinect": DepthNoise(),
+    "stereo": stereo_noise(447.0, 0.05),  # of a RealSense D435 at its best size: 848 pixels for 87°, 50 mm between its cameras
+    "exact": EXACT_DEPTH,
+}
 
 
 @dataclass(frozen=True)
@@ -98,7 +112,8 @@ def choose_calibration(folder: Path, choice: str, default: str = "") -> Calibrat
 
 def read_camera_file(path: Path) -> Calibration:
     """Read a camera.yaml: `width height fx fy cx cy depth_scale [distortion k1 k2 p1 p2 k3] [fps]
-    [depth_noise kinect|exact] [depth_offset] [depth_radial] [depth_camera fx fy cx cy [translation_m] [rotation_deg]] [sigmas]`.
+    [depth_noise kinect|stereo|exact, or a_m b c_per_m floor_m] [depth_offset] [depth_radial]
+    [depth_camera fx fy cx cy [translation_m] [rotation_deg]] [sigmas]`.
 
     Raises DataError naming file and key."""
     try:
@@ -131,12 +146,10 @@ def _calibration(path: Path, content: dict[str, Any]) -> Calibration:
             )
     if values["width"] * values["height"] > MAX_PIXELS:
         raise DataError(str(path), "describes no camera", f"give an image of at most {MAX_PIXELS} pixels")
-    noise = content.get("depth_noise", "kinect")
-    if not isinstance(noise, str) or noise not in NOISES:
-        raise DataError(str(path), f"depth_noise is '{_printable_value(noise)}'", did_you_mean(_printable_value(noise), NOISES))
+    noise = _depth_noise(path, content.get("depth_noise", "kinect"))
     fx, fy, cx, cy = (values[key] for key in ("fx", "fy", "cx", "cy"))
     sigmas = _sigmas(path, content.get("sigmas"))
-    camera = Camera(int(values["width"]), int(values["height"]), fx, fy, cx, cy, values.get("fps", Camera.fps), NOISES[noise], sigmas)
+    camera = Camera(int(values["width"]), int(values["height"]), fx, fy, cx, cy, values.get("fps", Camera.fps), noise, sigmas)
     offset, radial = values.get("depth_offset", 0.0), values.get("depth_radial", 0.0)
     if abs(radial) > LARGEST_RADIAL:
         raise DataError(
@@ -160,6 +173,23 @@ def calibration_fault(found: Calibration) -> str:
     if (depth := found.depth_camera) is not None:
         fault = camera_fault(replace(found.camera, fx=depth.fx, fy=depth.fy, cx=depth.cx, cy=depth.cy))
     return f"depth_camera.{fault}" if fault else ""
+
+
+def _depth_noise(path: Path, given: Any) -> DepthNoise:
+    """The noise of a sensor by name, or a mapping of some of the fields of `DepthNoise`; the others are 0, and the floor a millimetre."""
+    if not isinstance(given, dict):
+        if not isinstance(given, str) or given not in NOISES:
+            raise DataError(str(path), f"depth_noise is '{_printable_value(given)}'", did_you_mean(_printable_value(given), NOISES))
+        return NOISES[given]
+    known = tuple(field.name for field in fields(DepthNoise))
+    _check_keys(path, "depth_noise", given, known, "give it some of")
+    numbers = {key: _number(path, f"depth_noise.{key}", value) for key, value in given.items()}
+    noise = replace(EXACT_DEPTH, **numbers)
+    far = next((key for key, value in numbers.items() if abs(value) > LARGEST_NOISE), "floor_m" if noise.floor_m <= 0.0 else "")
+    if far:
+        cure = f"give floor_m above 0 and the others within ±{LARGEST_NOISE:g}: σ is max(floor_m, a_m + b z + c_per_m z²) at z metres"
+        raise DataError(str(path), f"depth_noise.{far} is {_printable_value(given.get(far))}", cure)
+    return noise
 
 
 def _sigmas(path: Path, given: Any) -> CalibrationSigmas:

@@ -12,11 +12,12 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
+from trihedron.datasets.readers.cameras import stereo_noise
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.libraries import imports_of
 from trihedron.pipeline.core.options import Frames, PositiveInt, frame_range
 from trihedron.pipeline.core.registry import register
-from trihedron.pipeline.core.types import Camera, Frame, Trajectory
+from trihedron.pipeline.core.types import Camera, DepthNoise, Frame, Trajectory
 
 log = logging.getLogger("trihedron")
 ENDLESS = 1 << 30
@@ -102,18 +103,24 @@ class _Stream:
         except RuntimeError as error:
             raise DataError("dataset=realsense", f"the camera does not start: {error}", "plug it in, or choose another size and rate") from error
         self._scale = float(profile.get_device().first_depth_sensor().get_depth_scale())
-        self._camera, self._lens = self._calibration(profile.get_stream(rs.stream.color).as_video_stream_profile().get_intrinsics())
+        color, depth = (profile.get_stream(stream).as_video_stream_profile().get_intrinsics() for stream in (rs.stream.color, rs.stream.depth))
+        self._camera, self._lens = self._calibration(color, self._depth_noise(profile.get_device().first_depth_sensor(), float(depth.fx)))
         self._number, self._newest, self._taken = -1, None, (-1, None)
         self._came_s, self._last_stamp = 0.0, -1
         self._running = True
         self._thread = threading.Thread(target=self._keep, name="realsense", daemon=True)
         self._thread.start()
 
-    def _calibration(self, found: Any) -> tuple[Camera, Any]:
+    def _depth_noise(self, sensor: Any, focal_px: float) -> DepthNoise:
+        """The noise of a stereo camera, which states its baseline in mm; that of a Kinect for another, which is no less."""
+        baseline = self._library.option.stereo_baseline
+        return stereo_noise(focal_px, 1e-3 * float(sensor.get_option(baseline))) if sensor.supports(baseline) else DepthNoise()
+
+    def _calibration(self, found: Any, noise: DepthNoise) -> tuple[Camera, Any]:
         coefficients = np.array(found.coeffs, float)
         if coefficients.any() and str(found.model) != LENS:
             raise DataError("dataset=realsense", f"the distortion model '{found.model}' is not known", "choose a size whose colour is undistorted")
-        camera = Camera(found.width, found.height, found.fx, found.fy, found.ppx, found.ppy, float(self._options.fps))
+        camera = Camera(found.width, found.height, found.fx, found.fy, found.ppx, found.ppy, float(self._options.fps), noise)
         return camera, coefficients if coefficients.any() else None
 
     def _keep(self) -> None:

@@ -25,6 +25,15 @@ def test_a_camera_file_says_everything(tmp_path: Path) -> None:
     assert found.camera.depth_noise == EXACT_DEPTH
 
 
+@pytest.mark.parametrize(
+    "text, sigma_m",  # at 2 m
+    [("stereo", 0.1 * 4.0 / (447.0 * 0.05)), ("kinect", 0.01182), ("{b: 0.005, floor_m: 0.002}", 0.01), ("{floor_m: 0.017}", 0.017), ("{}", 0.001)],
+)
+def test_depth_noise_is_that_of_a_sensor_or_given_in_numbers(tmp_path: Path, text: str, sigma_m: float) -> None:
+    (tmp_path / "camera.yaml").write_text(GOOD + f"depth_noise: {text}\n")
+    assert read_camera_file(tmp_path / "camera.yaml").camera.depth_noise.sigma_m(2.0) == pytest.approx(sigma_m, rel=1e-6)
+
+
 @pytest.mark.parametrize("text", ["[0.1, 0.2, 0.3, 0.4, 5e-1]", "0.1 0.2 0.3 0.4 0.5", "0.1, 0.2, 0.3, 0.4, 0.5"])
 def test_distortion_may_be_a_list_or_a_line(tmp_path: Path, text: str) -> None:
     (tmp_path / "camera.yaml").write_text(GOOD + f"distortion: {text}\n")
@@ -81,6 +90,16 @@ BAD = [
         "{}: distortion holds coefficients that are not within ±100; give the numbers of a calibration, in pixels",
     ),
     (GOOD + "depth_noise: kinnect\n", "{}: depth_noise is 'kinnect'; did you mean 'kinect'?"),
+    (GOOD + "depth_noise: {c: 0.003}\n", "{}: unknown key 'depth_noise.c'; known: a_m, b, c_per_m, floor_m"),
+    (GOOD + "depth_noise: {b: small}\n", "{}: depth_noise.b is 'small'; give a finite number"),
+    *(
+        (
+            GOOD + f"depth_noise: {{{key}: {value}}}\n",
+            f"{{}}: depth_noise.{key} is {value}; give floor_m above 0 and the others within ±10: "
+            "σ is max(floor_m, a_m + b z + c_per_m z²) at z metres",
+        )
+        for key, value in (("floor_m", 0), ("c_per_m", 11.5))
+    ),
     (GOOD + "depth_radial: 0.6\n", "{}: depth_radial is 0.6; give a relative error within ±0.5"),
     (GOOD + "depth_camera: 580\n", "{}: depth_camera holds no keys; give it fx fy cx cy translation_m rotation_deg"),
     (GOOD + "depth_camera: {fx: 580, fy: 580, cx: 320}\n", "{}: the key 'depth_camera.cy' is missing; give it fx fy cx cy"),

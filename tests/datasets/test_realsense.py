@@ -12,6 +12,7 @@ import pytest
 
 from trihedron.datasets.readers.realsense import RealSense
 from trihedron.pipeline.core.errors import DataError, LibraryError
+from trihedron.pipeline.core.types import DepthNoise
 from trihedron.pipeline.run.live import is_camera
 
 SPACE_S = 0.01
@@ -31,7 +32,7 @@ class Image:
 class Pipeline:
     """Frame k, all of colour k, comes every 10 ms; after `ends` frames the plug is pulled."""
 
-    ends, coeffs, starts, calls = 1000, [0.0] * 5, 0, 0
+    ends, coeffs, starts, calls, stereo = 1000, [0.0] * 5, 0, 0, True
     asked: list[Any] = []  # noqa: RUF012  what the configuration enabled
 
     def start(self, config: Any) -> Any:
@@ -40,7 +41,7 @@ class Pipeline:
         Pipeline.starts += 1
         Pipeline.asked = config
         self._count = Pipeline.calls = 0
-        sensor = SimpleNamespace(get_depth_scale=lambda: 0.00025)
+        sensor = SimpleNamespace(get_depth_scale=lambda: 0.00025, supports=lambda option: Pipeline.stereo, get_option={"stereo_baseline": 50.0}.get)
         lens = SimpleNamespace(width=8, height=6, fx=5.0, fy=6.0, ppx=3.5, ppy=2.5, coeffs=Pipeline.coeffs, model="distortion.inverse_brown_conrady")
         video = SimpleNamespace(get_intrinsics=lambda: lens)
         return SimpleNamespace(
@@ -80,6 +81,7 @@ def library(monkeypatch: pytest.MonkeyPatch) -> None:
     fake = SimpleNamespace(
         pipeline=Pipeline, config=Config, align=lambda stream: SimpleNamespace(process=lambda pair: pair),
         stream=SimpleNamespace(color="color", depth="depth"), format=SimpleNamespace(rgb8="rgb8", z16="z16"),
+        option=SimpleNamespace(stereo_baseline="stereo_baseline"),
     )  # fmt: skip
     monkeypatch.setitem(sys.modules, "pyrealsense2", fake)
     Pipeline.ends, Pipeline.coeffs = 1000, [0.0] * 5
@@ -100,6 +102,19 @@ def test_the_newest_frame_is_given_and_the_others_dropped(library: None) -> None
     assert frame.stamp_ns == round((1e12 + 10.0 * late.number) * 1e6)
     assert np.allclose(frame.depth_m, (4000 + late.number) * 0.00025) and (frame.camera.fx, frame.camera.cy) == (5.0, 2.5)
     assert camera(first.number) is None  # gone
+    camera.stop()
+
+
+@pytest.mark.parametrize("stereo", [True, False])
+def test_depth_is_as_noisy_as_that_of_the_camera(library: None, monkeypatch: pytest.MonkeyPatch, stereo: bool) -> None:
+    """A stereo camera states its baseline, here 50 mm with a focal length of 5 px; one with a laser scanner does not."""
+    monkeypatch.setattr(Pipeline, "stereo", stereo)
+    camera = RealSense()
+    camera.start()
+    arrival = camera.wait(-1)
+    frame = camera(arrival.number) if arrival is not None else None
+    assert frame is not None
+    assert frame.camera.depth_noise == (DepthNoise(0.0, 0.0, 0.1 / (5.0 * 0.05), 0.001) if stereo else DepthNoise())
     camera.stop()
 
 

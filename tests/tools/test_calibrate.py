@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import yaml
 
-from trihedron.datasets.readers.cameras import Calibration, read_camera_file
+from trihedron.datasets.readers.cameras import NOISES, Calibration, read_camera_file
 from trihedron.datasets.readers.registration import DepthCamera
 from trihedron.datasets.simulation.synthetic import Synthetic
 from trihedron.pipeline.app.cli import main
@@ -76,7 +76,7 @@ def test_a_recommended_camera_projects_depth_where_the_edges_are():
     assert np.allclose(color.project(point[None])[0], expected, atol=1e-6)
 
 
-@pytest.mark.parametrize("noise", [DepthNoise(), EXACT_DEPTH])
+@pytest.mark.parametrize("noise", [DepthNoise(), EXACT_DEPTH, NOISES["stereo"], DepthNoise(0.001, 0.002, 0.003, 0.004)])
 def test_the_file_that_is_written_is_read_back(tmp_path, noise):
     depth = DepthCamera(589.137, 589.137, 314.246, 244.402, (-0.04075, 0.00441, 0.0), (0.1, 0.0, -0.2))
     given = Calibration(replace(CAMERA, depth_noise=noise), 1000.0, (0.1, 0.0, 0.0, 0.0, 0.0), 0.012, -0.01, depth)
