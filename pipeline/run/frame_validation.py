@@ -178,12 +178,13 @@ class FrameValidation:
 
     def _without_frozen_color(self, position: int, frame: Frame | None) -> Frame | None:
         """Return the frame with black colour where that is frozen: the depth behind its key points is not theirs. Where colour is just late, or
-        slower than depth, the frame is left out: the next one would find no key point in a black image."""
+        slower than depth, the frame is left out, since the next one would find no key point in a black image; not a plain one, which has none."""
         if frame is None:
             return None
         since = self._color.since(frame)
         young = self._color.known_rate() or age_ns(frame, since) < STALE_NS
         repeats = since is not None and self._color.change >= (LATE_SHARE if young else CHANGED_SHARE)
+        repeats = repeats and not (young and frame.color.min() == frame.color.max())
         self._color.warn(frame, since, (SKIPPED if young else MISSING) if repeats else "", position + 1 == self._count)
         if repeats and young:
             self.left_out.add(position)

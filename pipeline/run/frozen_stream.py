@@ -37,7 +37,7 @@ class FrozenStream:
     """Detects one stream, depth or colour, that stands still, bit-identical frame after frame, while the other goes on; and one that is slower.
 
     The other is compared with that of the first frame with this image: the change adds up while the camera moves. A camera at rest shows no change
-    beyond its noise. A plain image, black for one, shows nothing that could stand still.
+    beyond its noise.
 
     `period` is the number of frames from one new image to the next where that is regular, 1 before it is known to be; `undecided` while nothing but
     repeated images came, too few to know. `change` is the share (0 … 1) of the other image that has changed beyond noise since the present one came,
@@ -62,7 +62,7 @@ class FrozenStream:
             return None
         self._length += 1
         self.undecided = self.undecided and frame.stamp_ns - first.stamp_ns < UNDECIDED_NS
-        if _is_plain(stream.image(frame)) or _bit_identical(stream.other_image(first), stream.other_image(frame)):
+        if not stream.image(frame).any() or _bit_identical(stream.other_image(first), stream.other_image(frame)):
             return None
         self._goes_on = True
         self.change = 1.0 if self.period > 1 else stream.other_change(first, frame)
@@ -125,11 +125,6 @@ def _bit_identical(a: F32 | U8, b: F32 | U8) -> bool:
     """Compare a row first: two images that differ nearly always differ there."""
     row = len(a) // 2
     return np.array_equal(a[row : row + 1], b[row : row + 1]) and np.array_equal(a, b)
-
-
-def _is_plain(image: F32 | U8) -> bool:
-    """Return True for an image of one value alone."""
-    return bool(image.min() == image.max())
 
 
 def _depth(frame: Frame) -> F32:
