@@ -102,9 +102,10 @@ class _Stream:
             profile = self._pipeline.start(config)
         except RuntimeError as error:
             raise DataError("dataset=realsense", f"the camera does not start: {error}", "plug it in, or choose another size and rate") from error
-        self._scale = float(profile.get_device().first_depth_sensor().get_depth_scale())
+        sensor = profile.get_device().first_depth_sensor()
+        self._scale = float(sensor.get_depth_scale())
         color, depth = (profile.get_stream(stream).as_video_stream_profile().get_intrinsics() for stream in (rs.stream.color, rs.stream.depth))
-        self._camera, self._lens = self._calibration(color, self._depth_noise(profile.get_device().first_depth_sensor(), float(depth.fx)))
+        self._camera, self._lens = self._calibration(color, self._depth_noise(sensor, float(depth.fx)))
         self._number, self._newest, self._taken = -1, None, (-1, None)
         self._came_s, self._last_stamp = 0.0, -1
         self._running = True

@@ -12,7 +12,7 @@ import numpy as np
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.types import F32, Camera, Frame
 from trihedron.pipeline.core.value_checks import camera_fault
-from trihedron.pipeline.run.frozen_stream import CHANGED_SHARE, COLOR, DEPTH, LATE_SHARE, STALE_NS, FrozenStream, age_ns
+from trihedron.pipeline.run.frozen_stream import CHANGED_SHARE, COLOR, DEPTH, LATE_SHARE, SAMPLED_PX, STALE_NS, FrozenStream, age_ns
 from trihedron.pipeline.run.registration_check import RegistrationCheck
 
 log = logging.getLogger("trihedron")
@@ -24,7 +24,6 @@ LEAST_DEPTH = 0.01  # of the image, with which a run can begin
 DARK_NS = 1_000_000_000  # for which black colour at the beginning is that of a camera that starts, not of a dark room
 AWAY_S = 0.5  # to a frame that shows surfaces at other distances
 JUDGED = 10  # readable frames after which the scale of depth is judged
-SAMPLED_PX = 8  # apart are the readings by which scale and limit are judged
 FARTHEST_M = 1000.0  # beyond this no camera measures depth, and the covariance of a point is singular in double precision
 MILLIMETRES = 100.0  # metres, from which the median depth of a frame is one in millimetres
 OFF_CENTRE = 0.15  # of width or height: farther from the centre no camera has its principal point, unless images are cropped
@@ -99,11 +98,11 @@ def constant_share(depth_m: F32) -> float:
     return float(np.count_nonzero(readings == np.partition(readings, middle)[middle]) / readings.size)
 
 
-def _missing(frame: Frame, age_ns: int) -> str:
+def _missing(frame: Frame, running_ns: int) -> str:
     """Return what a run cannot begin without and the frame does not have: depth, or, in the first second, colour; "" for a frame that has both."""
     if np.count_nonzero(frame.depth_m) < LEAST_DEPTH * frame.depth_m.size:
         return "depth"
-    return "" if age_ns >= DARK_NS or frame.color.any() else "colour"
+    return "" if running_ns >= DARK_NS or frame.color.any() else "colour"
 
 
 class FrameValidation:
@@ -122,9 +121,7 @@ class FrameValidation:
         self._registration = RegistrationCheck()
         self._camera: Camera | None = None  # the latest that was found without a fault: nearly always that of all frames
         self._first_ns: int | None = None
-        self._missing: str | None = (
-            "" if known else None
-        )  # from the latest frame, until one had all; those before known ones may have shown something
+        self._missing = "" if known else "depth"  # until a frame has all that a run begins with; those before known ones may have had it
         self.left_out: set[int] = set()
 
     def __call__(self, position: int, read: Callable[[int], Any], index: Callable[[], int]) -> Any:
@@ -151,7 +148,8 @@ class FrameValidation:
     def _begins(self, position: int, frame: Frame) -> bool:
         """Return True for a frame that shows something and for those after it; else the frame is left out."""
         self._first_ns = frame.stamp_ns if self._first_ns is None else self._first_ns
-        self._missing = "" if self._missing == "" else _missing(frame, frame.stamp_ns - self._first_ns)
+        if self._missing:
+            self._missing = _missing(frame, frame.stamp_ns - self._first_ns)
         if self._missing:
             log.warning("frame %d: it has no %s, nor has any before it; it is skipped", frame.index, self._missing)
             self.left_out.add(position)
@@ -160,9 +158,8 @@ class FrameValidation:
     def check_begun(self) -> None:
         """Raise DataError where every frame was skipped because nothing was shown."""
         if self.left_out and self._missing:
-            raise DataError(
-                "dataset", f"none of {len(self.left_out)} frames has {self._missing}", "check its images, and the depth_scale of its camera"
-            )
+            cause = f"none of {len(self.left_out)} frames has {self._missing}"
+            raise DataError("dataset", cause, "check its images, and the depth_scale of its camera")
 
     def _without_faulty_depth(self, position: int, frame: Frame | None) -> Frame | None:
         """Return the frame without its depth where that is constant (saturated, for one) or frozen: whatever is tracked by it is wrong."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass
+from operator import attrgetter
 
 import numpy as np
 
@@ -17,13 +18,13 @@ RATE_IMAGES = 4  # in a row that each repeat equally often, which shows a slower
 CHANGED_LEVELS, CHANGED_SIGMAS = 16, 7.0  # grey levels, and standard deviations of depth, beyond the noise of an image
 CHANGED_SHARE = 0.02  # of the pixels, by which an image has changed
 LATE_SHARE = 0.005  # the same where it costs a single frame to be wrong: 0.0024 at rest, at least 0.008 of a slow walk through a synthetic room
-SAMPLED_PX = 8  # apart are the pixels that are compared
+SAMPLED_PX = 8  # apart are the pixels by which images are judged
 
 
 @dataclass(frozen=True)
 class Stream:
-    """One of the two images of a frame, and the share of the other that has changed beyond noise. `slower` says what becomes of a repeated image
-    where the stream is slower, and the cure."""
+    """One of the two images of a frame, and the share of the other that has changed beyond noise. `slower` states what becomes of a repeated
+    image where the stream is slower, and the cure."""
 
     name: str
     other: str
@@ -127,23 +128,15 @@ def _bit_identical(a: F32 | U8, b: F32 | U8) -> bool:
     return np.array_equal(a[row : row + 1], b[row : row + 1]) and np.array_equal(a, b)
 
 
-def _depth(frame: Frame) -> F32:
-    return frame.depth_m
-
-
-def _color(frame: Frame) -> U8:
-    return frame.color
-
-
 def _sampled_gray(frame: Frame) -> F32:
     return np.asarray(frame.color[::SAMPLED_PX, ::SAMPLED_PX].mean(axis=2, dtype=np.float32))
 
 
 DEPTH = Stream(
-    "depth", "colour", _depth, _color, color_change,
+    "depth", "colour", attrgetter("depth_m"), attrgetter("color"), color_change,
     "a repeated one counts as missing; record depth at the rate of colour, or take the frames with new depth alone: {fresh}",
 )  # fmt: skip
 COLOR = Stream(
-    "colour", "depth", _color, _depth, depth_change,
+    "colour", "depth", attrgetter("color"), attrgetter("depth_m"), depth_change,
     "frames that repeat one are skipped; give more light, with which most cameras are faster, or record depth at the rate of colour",
 )  # fmt: skip
