@@ -418,7 +418,7 @@ def test_a_camera_that_is_none_is_refused_where_it_is_made(numbers, message):
     for make in (th.Camera, lambda *given: th.Camera.of(types.Camera(*given))):
         with pytest.raises(th.TrihedronError) as error:
             make(*numbers)
-        assert str(error.value) == f"camera: {message}; give the numbers of a calibration, in pixels"
+        assert str(error.value) == f"camera: {message}; give the numbers of a calibration, in pixels and seconds"
 
 
 def test_what_is_no_camera_is_refused():

@@ -2,10 +2,10 @@
 
 Edges of depth are laid on gradients of colour: registration of the depth camera (focal length, centre, offset), and the delay of depth. Points that
 pairs of frames observed give fx and fy against depth, errors of depth that grow with range (`depth_offset`, 1/m, added to inverse depths) and
-towards the corners of the image (`depth_radial`), and the readout time of a rolling shutter. A scale of all depths is not observable. The gain of a
-change is the relative decrease of the cost on blocks of frames that were held out, with its standard error over the blocks; what does not gain
-significantly is not recommended, nor is a registration that moves depth by less than its edges may be off. Where something is recommended, the lines
-for camera.yaml are printed, and --out writes the whole file: run again with it.
+towards the corners of the image (`depth_radial`), and the readout times of rolling shutters (`readout_s`, `depth_readout_s`). A scale of all depths
+is not observable. The gain of a change is the relative decrease of the cost on blocks of frames that were held out, with its standard error over the
+blocks; what does not gain significantly is not recommended, nor is a registration that moves depth by less than its edges may be off. Where something
+is recommended, the lines for camera.yaml are printed, and --out writes the whole file: run again with it.
 
 Example: trihedron calibrate runs/a/run.mcap --out camera.yaml
 """
@@ -39,7 +39,8 @@ from trihedron.tools.calibration_recording import Recorded, pairs_of, read_recor
 
 DELAY = (5,)  # of the edges' parameters; always estimated with the others
 REGISTRATIONS = ((1, 2), (0, 1, 2), (0, 1, 2, 3, 4))  # sets of the edges' parameters, each a part of the next
-SHUTTER = (3, 4)  # readout and delay among the parameters of pairs; always estimated with the others
+READOUTS = {"readout_s": 3, "depth_readout_s": 5}  # of pairs
+SHUTTER = (3, 4, 5)  # the same and the delay; always estimated with the others
 CHANGES = {"focal lengths": (0,), "depth_offset": (1,), "depth_radial": (2,)}  # of pairs
 NONE = Judgement(0.0, float("inf"), 0, False)
 
@@ -95,7 +96,7 @@ def recommend(recording: Recording) -> Recommendation:
     found = estimate(recorded)
     changed = with_estimates(used, found)
     before, after = keys_of(used), _changed_keys(used, changed)
-    gains = [(name, one) for name, one in found.judgements.items() if one.recommended and name != "readout"]  # which nothing applies
+    gains = [(name, one) for name, one in found.judgements.items() if one.recommended]
     changes = [f"{name}: the half that was held out is {100 * one.gain:.1f} ± {100 * one.sigma:.1f} % better" for name, one in gains]
     changes += [f"{key} is {_in_a_line(value)}, was {_in_a_line(before[key]) if key in before else 'not stated'}" for key, value in after.items()]
     return Recommendation(_as_yaml(keys_of(changed)) if changed != used else "", 1e3 * float(found.edges[5]), changes)
@@ -197,12 +198,13 @@ def _by_pairs(pairs: Pairs, judgements: dict[str, Judgement], has_ratio: bool) -
         if not found[best].recommended:
             break
         accepted += remaining.pop(best)
-    judgements["readout"] = judge_change(tuple(k for k in accepted if k != SHUTTER[0]), accepted)
+    judgements.update({name: judge_change(tuple(k for k in accepted if k != readout), accepted) for name, readout in READOUTS.items()})
     everything = fit(pairs, range(len(calibration_pairs.NAMES)), scale)[0]
     chosen = fit(pairs, accepted, scale)[0].parameters
     recommended = np.where(np.isin(np.arange(len(chosen)), accepted), chosen, 0.0)
-    recommended[SHUTTER[1]] = 0.0
-    recommended[SHUTTER[0]] *= judgements["readout"].recommended
+    recommended[4] = 0.0
+    for name, readout in READOUTS.items():
+        recommended[readout] *= judgements[name].recommended
     return recommended, (everything.parameters, np.sqrt(np.diag(everything.covariance)))
 
 
@@ -217,8 +219,7 @@ def report(found: Estimates, camera: Camera) -> str:
         known = bool(np.isfinite(sigma))
         cells = [f"{value:.{decimals}f}", f"{sigma:.{decimals}f}"] if known else ["-", "-"]
         gain = [f"{100 * verdict.gain:.1f} %", f"{100 * verdict.sigma:.1f} %"] if np.isfinite(verdict.sigma) else ["-", "-"]
-        applied = "not applied" if name == "readout" else "yes"  # it is estimated so that it does not bias the others
-        rows.append([label, *cells, *gain, applied if verdict.recommended else "no"])
+        rows.append([label, *cells, *gain, "yes" if verdict.recommended else "no"])
 
     row("colour focal length / depth focal length", float(np.exp(edges[0])), float(edge_sigmas[0]), "registration", 4)
     for k, axis in ((1, "x"), (2, "y")):
@@ -230,7 +231,8 @@ def report(found: Estimates, camera: Camera) -> str:
     row(f"fx (px; {camera.fx:g} in use, fy alike)", camera.fx * factor, camera.fx * factor * float(pair_sigmas[0]), "focal lengths", 2)
     row("depth_offset (1/m)", float(pairs[1]), float(pair_sigmas[1]), "depth_offset", 5)
     row("depth_radial", float(pairs[2]), float(pair_sigmas[2]), "depth_radial", 4)
-    row("readout_ms", 1e3 * float(pairs[3]), 1e3 * float(pair_sigmas[3]), "readout", 1)
+    row("readout_s (added to that in use)", float(pairs[3]), float(pair_sigmas[3]), "readout_s", 4)
+    row("depth_readout_s (added to that in use)", float(pairs[5]), float(pair_sigmas[5]), "depth_readout_s", 4)
     return table(rows, "lrrrrr")
 
 
@@ -260,7 +262,8 @@ def with_estimates(used: Calibration, found: Estimates) -> Calibration:
         depth_camera = replace(depth_camera, fx=fx, fy=fy, translation_m=(x / factor, y / factor, z))
     camera = replace(camera, fx=camera.fx * factor, fy=camera.fy * factor)
     offset, radial = used.depth_offset + float(found.pairs[1]), used.depth_radial + float(found.pairs[2])
-    return replace(used, camera=camera, depth_camera=depth_camera, depth_offset=offset, depth_radial=radial)
+    readouts = {name: getattr(used, name) + float(found.pairs[k]) for name, k in READOUTS.items()}
+    return replace(used, camera=camera, depth_camera=depth_camera, depth_offset=offset, depth_radial=radial, **readouts)
 
 
 def _depth_camera(used: DepthCamera | None, camera: Camera, edges: F64) -> DepthCamera | None:
@@ -283,6 +286,7 @@ def keys_of(calibration: Calibration) -> dict[str, Any]:
     keys |= {"depth_scale": calibration.depth_scale, "fps": camera.fps}
     keys |= {"distortion": list(calibration.distortion)} if calibration.distortion else {}
     keys |= {name: round(value, 6) for name in ("depth_offset", "depth_radial") if (value := getattr(calibration, name))}
+    keys |= {name: round(value, 4) for name in ("readout_s", "depth_readout_s") if (value := getattr(calibration, name))}
     if camera.depth_noise != DepthNoise():
         names = {noise: name for name, noise in NOISES.items()}
         keys["depth_noise"] = names.get(camera.depth_noise) or asdict(camera.depth_noise)

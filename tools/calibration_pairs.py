@@ -1,12 +1,13 @@
-"""Calibration from points that pairs of frames observed: focal lengths, errors of depth by range and across the image, and a rolling shutter.
+"""Calibration from points that pairs of frames observed: focal lengths, errors of depth by range and across the image, and rolling shutters.
 
 A point observed at pixel p with depth z, in a row that was read `s = readout (row - c_y) / h` after the middle one, was at
 
     X = z' ((p - c) / f, 1),  1 / z' = (1 + radial r²) / z + offset,  and in the middle of the exposure at  X + s (v + ω × X)
 
-in the camera's frame, which moves with angular rate ω and velocity v. The reading was taken `delay` later: z is the measured depth less delay times
-the rate at which the depth at a pixel changes as the camera moves. One factor is estimated for fx and fy: pixels are squarer than two factors would
-be known. The motion between the two frames of a pair is estimated with the parameters, so that an error of the trajectory does not enter. Residuals
+in the camera's frame, which moves with angular rate ω and velocity v. The reading was taken later by `delay`, and by its row's part of the readout of
+depth instead of s: z is the measured depth less that time times the rate at which the depth at a pixel changes as the camera moves. One factor is
+estimated for fx and fy: pixels are squarer than two factors would be known. The motion between the two frames of a pair is estimated with the
+parameters, so that an error of the trajectory does not enter. Residuals
 are pixels and inverse depth in the second frame, robust (Geman and McClure). The covariance is that of an M-estimator whose terms are blocks of pairs
 ("sandwich": Huber, 1967), for what a calibration lacks is common to neighbouring pairs.
 """
@@ -23,8 +24,8 @@ from trihedron.pipeline.core.lie import exp_so3
 from trihedron.pipeline.core.types import F64, Bool, Camera
 
 I64 = NDArray[np.int64]
-NAMES = ("log_focal", "depth_offset", "depth_radial", "readout_s", "delay_s")
-PRIOR = np.array([0.3, 0.05, 0.1, 0.05, 0.05])  # standard deviations
+NAMES = ("log_focal", "depth_offset", "depth_radial", "readout_s", "delay_s", "depth_readout_s")
+PRIOR = np.array([0.3, 0.05, 0.1, 0.05, 0.05, 0.05])  # standard deviations
 STEP = 1e-4  # of the derivatives
 GATE2 = 9.0  # squared Mahalanobis distance, at the scale of the residuals, at which a point counts a quarter
 MEDIAN_CHI2 = 2.366  # of three degrees of freedom
@@ -76,7 +77,7 @@ class Pairs:
 
 @dataclass(frozen=True)
 class Fit:
-    """Parameters (5,) in the order of NAMES, their covariance (5, 5), 0 for those that were held, and the robust cost (m,) of each pair: a mean over
+    """Parameters (6,) in the order of NAMES, their covariance (6, 6), 0 for those that were held, and the robust cost (m,) of each pair: a mean over
     its points."""
 
     parameters: F64
@@ -90,19 +91,20 @@ def positions(camera: Camera, seen: Observations, parameters: F64) -> F64:
     apart = seen.pixels - [camera.cx, camera.cy]
     z = 1.0 / _inverse_depths(camera, seen, parameters)
     points = np.concatenate([apart / focal * z[:, None], z[:, None]], axis=1)
-    return np.asarray(points + _late(camera, seen, parameters)[:, None] * _velocity(seen, points), np.float64)
+    return np.asarray(points + (parameters[3] * _rows(camera, seen))[:, None] * _velocity(seen, points), np.float64)
 
 
 def _inverse_depths(camera: Camera, seen: Observations, parameters: F64) -> F64:
     """(n,) corrected inverse depths."""
     radius2 = ((seen.pixels - [camera.cx, camera.cy]) ** 2).sum(axis=1) / ((camera.width**2 + camera.height**2) / 4.0)
-    z = np.maximum(seen.depths_m - parameters[4] * seen.depth_rates, 0.05)
+    later_s = parameters[4] + (parameters[5] - parameters[3]) * _rows(camera, seen)
+    z = np.maximum(seen.depths_m - later_s * seen.depth_rates, 0.05)
     return np.asarray(np.maximum((1.0 + parameters[2] * radius2) / z + parameters[1], 1e-3), np.float64)
 
 
-def _late(camera: Camera, seen: Observations, parameters: F64) -> F64:
-    """(n,) seconds from the middle row to the row of each pixel."""
-    return np.asarray(parameters[3] * (seen.pixels[:, 1] - 0.5 * (camera.height - 1)) / camera.height, np.float64)
+def _rows(camera: Camera, seen: Observations) -> F64:
+    """(n,) the row of each pixel, from -0.5 to 0.5."""
+    return np.asarray((seen.pixels[:, 1] - 0.5 * (camera.height - 1)) / camera.height, np.float64)
 
 
 def _velocity(seen: Observations, points: F64) -> F64:
@@ -118,7 +120,7 @@ def residuals(pairs: Pairs, motions: F64, parameters: F64) -> tuple[F64, F64]:
     R, t = motions[pairs.pair, :3, :3], motions[pairs.pair, :3, 3]
     rotated = np.einsum("nij,nj->ni", R, positions(camera, first, parameters))
     middle = rotated + t
-    q = middle - _late(camera, second, parameters)[:, None] * _velocity(second, middle)
+    q = middle - (parameters[3] * _rows(camera, second))[:, None] * _velocity(second, middle)
     z = np.maximum(q[:, 2], 0.05)
     apart = second.pixels - [camera.cx, camera.cy]
     measured = _inverse_depths(camera, second, parameters)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Any
 
 from trihedron.datasets.readers.images import MAX_PIXELS
 from trihedron.datasets.readers.registration import DepthCamera, Rectification
+from trihedron.datasets.readers.rolling_shutter import Look, SteadyFrames
 from trihedron.pipeline.core.errors import DataError, did_you_mean, printable
 from trihedron.pipeline.core.files import MAX_YAML_BYTES, SHOWN, YamlError, parse_yaml, read_text
 from trihedron.pipeline.core.types import EXACT_CALIBRATION, EXACT_DEPTH, CalibrationSigmas, Camera, DepthNoise
@@ -18,15 +20,18 @@ from trihedron.pipeline.core.value_checks import camera_fault
 
 CAMERA_FILE = "camera.yaml"
 REQUIRED = ("width", "height", "fx", "fy", "cx", "cy", "depth_scale")
-OPTIONAL = ("distortion", "fps", "depth_noise", "depth_offset", "depth_radial", "depth_camera", "sigmas")
+OPTIONAL = ("distortion", "fps", "depth_noise", "depth_offset", "depth_radial", "depth_camera", "readout_s", "depth_readout_s", "sigmas")
 SMALLEST_SCALE, LARGEST_SCALE = 1e-6, 1e9  # outside, single precision overflows
 LARGEST_COEFFICIENT = 100.0  # of a distortion; those of lenses are below 10
 LARGEST_RADIAL = 0.5
+LONGEST_READOUT_S = 0.1  # 1/30 s for most cameras
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")
 LARGEST_NOISE = 10.0  # of each coefficient: no sensor measures so badly
-NOMINAL = CalibrationSigmas()  # of a camera that nobody calibrated by itself
+# of a Kinect (the first) or an Xtion: 20 to 32 ms (see `datasets.simulation.sensor_models`), for both of its cameras
+KINECT_READOUT_S = 0.026
+KINECT = CalibrationSigmas(readout_s=0.004, depth_readout_s=0.004)
 # of a Kinect whose two cameras are taken to be usual ones: so far those of the TUM benchmark are from 525 px and the image's centre, root mean square
-USUAL_KINECT = CalibrationSigmas(focal=0.017, centre=0.013, depth_focal=0.017, registration=0.013)
+USUAL_KINECT = replace(KINECT, focal=0.017, centre=0.013, depth_focal=0.017, registration=0.013)
 SHORT = "give dataset.camera=tum_fr1, tum_fr2, tum_fr3, icl_nuim or a camera.yaml"
 
 
@@ -48,7 +53,7 @@ NOISES = {
 class Calibration:
     """The pinhole camera of a reader's frames, and the conversion of its files: depth file value per metre, lens distortion of both images
     (k1 k2 p1 p2 k3 of Brown's model, as OpenCV orders them; empty = none), what is added to inverse depths (1/m), the relative error of depth in the
-    corners of the image, and the separate camera of depth images that are not registered to colour."""
+    corners of the image, the separate camera of depth images that are not registered to colour, and the readout times (s) of rolling shutters."""
 
     camera: Camera
     depth_scale: float
@@ -56,31 +61,40 @@ class Calibration:
     depth_offset: float = 0.0
     depth_radial: float = 0.0
     depth_camera: DepthCamera | None = None
+    readout_s: float = 0.0
+    depth_readout_s: float = 0.0
 
     @cached_property
     def rectification(self) -> Rectification:
-        """The conversion of the images."""
+        """The conversion of an image by itself."""
         return Rectification(self.camera, self.distortion, self.depth_offset, self.depth_radial, self.depth_camera)
 
+    def steady_frames(self, read: Callable[[int], Look | None]) -> SteadyFrames | None:
+        """Return what removes the skew of rolling shutters, None where there are none; `read` returns the look of any frame."""
+        return SteadyFrames(self.camera, self.readout_s, self.depth_readout_s, read) if self.readout_s or self.depth_readout_s else None
 
-def _vga(fx: float, fy: float, cx: float, cy: float, *distortion: float, sigmas: CalibrationSigmas = NOMINAL) -> Calibration:
-    return Calibration(Camera(640, 480, fx, fy, cx, cy, sigmas=sigmas), 5000.0, distortion)
+
+def _kinect(fx: float, fy: float, cx: float, cy: float, *distortion: float) -> Calibration:
+    camera = Camera(640, 480, fx, fy, cx, cy, sigmas=KINECT)
+    return Calibration(camera, 5000.0, distortion, readout_s=KINECT_READOUT_S, depth_readout_s=KINECT_READOUT_S)
 
 
 PRESETS = {
     # TUM RGB-D benchmark, "Intrinsic Camera Calibration of the Kinect", colour camera; its depth images are registered to colour
-    "tum_fr1": _vga(517.3, 516.5, 318.6, 255.3, 0.2624, -0.9531, -0.0054, 0.0026, 1.1633),
-    "tum_fr2": _vga(520.9, 521.0, 325.1, 249.7, 0.2312, -0.7849, -0.0033, -0.0001, 0.9172),
-    "tum_fr3": _vga(535.4, 539.2, 320.1, 247.6),
+    "tum_fr1": _kinect(517.3, 516.5, 318.6, 255.3, 0.2624, -0.9531, -0.0054, 0.0026, 1.1633),
+    "tum_fr2": _kinect(520.9, 521.0, 325.1, 249.7, 0.2312, -0.7849, -0.0033, -0.0001, 0.9172),
+    "tum_fr3": _kinect(535.4, 539.2, 320.1, 247.6),
     # depth as the authors of the data set read it; the colour camera, which they did not calibrate, is that of a usual Kinect: OpenNI's focal length,
     # 25 mm to the right of depth (Konolige and Mihelich, "Technical description of Kinect calibration", 2012)
     "seven_scenes": Calibration(
         Camera(640, 480, 525.0, 525.0, 320.0, 240.0, sigmas=USUAL_KINECT),
         1000.0,
         depth_camera=DepthCamera(585.0, 585.0, 320.0, 240.0, (-0.025, 0.0, 0.0)),
+        readout_s=KINECT_READOUT_S,
+        depth_readout_s=KINECT_READOUT_S,
     ),
     # rendered by an exact camera; published with fy = -480, and the reader reflects the poses instead
-    "icl_nuim": _vga(481.2, 480.0, 319.5, 239.5, sigmas=EXACT_CALIBRATION),
+    "icl_nuim": Calibration(Camera(640, 480, 481.2, 480.0, 319.5, 239.5, sigmas=EXACT_CALIBRATION), 5000.0),
 }
 FOLDER_NAMES = {  # how the published archives are called
     "tum_fr1": r"freiburg1|(^|[^a-z])fr1",
@@ -113,7 +127,7 @@ def choose_calibration(folder: Path, choice: str, default: str = "") -> Calibrat
 def read_camera_file(path: Path) -> Calibration:
     """Read a camera.yaml: `width height fx fy cx cy depth_scale [distortion k1 k2 p1 p2 k3] [fps]
     [depth_noise kinect|stereo|exact, or a_m b c_per_m floor_m] [depth_offset] [depth_radial]
-    [depth_camera fx fy cx cy [translation_m] [rotation_deg]] [sigmas]`.
+    [depth_camera fx fy cx cy [translation_m] [rotation_deg]] [readout_s] [depth_readout_s] [sigmas]`.
 
     Raises DataError naming file and key."""
     try:
@@ -136,7 +150,8 @@ def read_camera_file(path: Path) -> Calibration:
 
 
 def _calibration(path: Path, content: dict[str, Any]) -> Calibration:
-    values = {key: _number(path, key, content[key]) for key in (*REQUIRED, "fps", "depth_offset", "depth_radial") if key in content}
+    optional = ("fps", "depth_offset", "depth_radial", "readout_s", "depth_readout_s")
+    values = {key: _number(path, key, content[key]) for key in (*REQUIRED, *optional) if key in content}
     if values["fy"] < 0.0:
         raise DataError(str(path), "fy is negative (y up)", "give it positive; dataset=icl_nuim reflects the published poses itself")
     for key in ("width", "height", "fx", "fy", "depth_scale", "fps"):
@@ -155,10 +170,11 @@ def _calibration(path: Path, content: dict[str, Any]) -> Calibration:
         raise DataError(
             str(path), f"depth_radial is {_printable_value(content['depth_radial'])}", f"give a relative error within ±{LARGEST_RADIAL:g}"
         )
+    readouts = values.get("readout_s", 0.0), values.get("depth_readout_s", 0.0)
     distortion, depth_camera = _distortion(path, content.get("distortion")), _depth_camera(path, content.get("depth_camera"))
-    calibration = Calibration(camera, values["depth_scale"], distortion, offset, radial, depth_camera)
+    calibration = Calibration(camera, values["depth_scale"], distortion, offset, radial, depth_camera, *readouts)
     if fault := calibration_fault(calibration):
-        raise DataError(str(path), fault, "give the numbers of a calibration, in pixels")
+        raise DataError(str(path), fault, "give the numbers of a calibration, in pixels and seconds")
     return calibration
 
 
@@ -170,6 +186,9 @@ def calibration_fault(found: Calibration) -> str:
         return f"depth_scale is not within {SMALLEST_SCALE:g} … {LARGEST_SCALE:g}"
     if not all(abs(coefficient) <= LARGEST_COEFFICIENT for coefficient in found.distortion):
         return f"distortion holds coefficients that are not within ±{LARGEST_COEFFICIENT:g}"
+    for key in ("readout_s", "depth_readout_s"):
+        if not abs(getattr(found, key)) <= LONGEST_READOUT_S:
+            return f"{key} is not within ±{LONGEST_READOUT_S:g}"
     if (depth := found.depth_camera) is not None:
         fault = camera_fault(replace(found.camera, fx=depth.fx, fy=depth.fy, cx=depth.cx, cy=depth.cy))
     return f"depth_camera.{fault}" if fault else ""

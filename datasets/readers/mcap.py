@@ -12,6 +12,7 @@ from trihedron.datasets.readers.cameras import Calibration, choose_calibration
 from trihedron.datasets.readers.images import check_camera
 from trihedron.datasets.readers.robot_recording import RobotRecording, Topics
 from trihedron.datasets.readers.robot_streams import ROS
+from trihedron.datasets.readers.rolling_shutter import Look, SteadyFrames, look_at
 from trihedron.datasets.readers.sequence import clip_range, refuse_video
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.files import one_line_errors
@@ -83,7 +84,19 @@ class McapDataset:
                 return frame
             check_camera(Path(self.path), frame.color, given.camera)
             color, depth_m = given.rectification.color(frame.color), given.rectification.depth(frame.depth_m)
-            return replace(frame, color=color, depth_m=depth_m, camera=given.camera)
+            frame = replace(frame, color=color, depth_m=depth_m, camera=given.camera)
+            return self._steady(self._range[index], frame) if self._steady is not None else frame
+
+    @cached_property
+    def _steady(self) -> SteadyFrames | None:
+        return self._given.steady_frames(self._look) if self._given is not None else None
+
+    def _look(self, position: int) -> Look | None:
+        """The look of a frame of the recording; None where there is none, or none that can be read."""
+        frame, given = self._frames.frame(position) if position < len(self._frames) else None, self._given
+        if frame is None or given is None or frame.color.shape[:2] != (given.camera.height, given.camera.width):
+            return None
+        return look_at(position, frame.stamp_ns, given.rectification.color(frame.color))
 
     def calibration(self) -> Calibration:
         """Return what the images are converted with: that of the camera file, or the camera that the recording states."""

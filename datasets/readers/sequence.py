@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from trihedron.datasets.readers.cameras import Calibration
 from trihedron.datasets.readers.images import check_camera, check_size, read_color, read_depth
 from trihedron.datasets.readers.picture_headers import UnreadableImage
+from trihedron.datasets.readers.rolling_shutter import Look, SteadyFrames, look_at
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.files import one_line_errors
 from trihedron.pipeline.core.options import Frames, frame_range
@@ -38,9 +39,9 @@ DepthReader = Callable[[Path], F32]
 
 @dataclass(frozen=True)
 class ImageSequence:
-    """Pairs of files with their stamps, read as frames. `numbers` are those of the pairs in the whole data set;
-    `depth_reader` replaces the reading of 16-bit images, `color_reader` that of colour. Frames are not cached: memory does not grow with
-    the sequence."""
+    """Pairs of files with their stamps, read as frames. `numbers` are those of the pairs in the whole data set, which is `whole` where these are a
+    part of it; `depth_reader` replaces the reading of 16-bit images, `color_reader` that of colour. Frames are not cached: memory does not grow
+    with the sequence."""
 
     stamps_ns: NDArray[np.int64]
     color_files: Sequence[Path]
@@ -50,12 +51,14 @@ class ImageSequence:
     numbers: range = range(sys.maxsize)
     depth_reader: DepthReader | None = None
     color_reader: Callable[[Path], U8] = read_color
+    whole: ImageSequence | None = None
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
 
     def frame(self, position: int) -> Frame | None:
-        """Read pair `position`, undistorted; None, after one warning, when a file cannot be read. Raises DataError for images of a wrong kind."""
+        """Read pair `position`, undistorted, without the skew of a rolling shutter whose readout time is stated; None, after one warning, when a file
+        cannot be read. Raises DataError for images of a wrong kind."""
         try:
             color = self._read(self.color_files[position], self.color_reader)
             depth = self._read(self.depth_files[position], self.depth_reader or self._read_depth)
@@ -64,7 +67,23 @@ class ImageSequence:
             return None
         self._check_sizes(position, color, depth)
         color, depth = self.calibration.rectification.color(color), self.calibration.rectification.depth(depth)
-        return Frame(self.numbers[position], int(self.stamps_ns[position]), color, depth, self.calibration.camera)
+        frame = Frame(self.numbers[position], int(self.stamps_ns[position]), color, depth, self.calibration.camera)
+        return self._steady(frame.index, frame) if self._steady is not None else frame
+
+    @cached_property
+    def _steady(self) -> SteadyFrames | None:
+        return self.calibration.steady_frames((self.whole or self)._look)
+
+    def _look(self, position: int) -> Look | None:
+        """The look of a frame of the whole data set; None where there is none, or none that can be read."""
+        if position >= len(self):
+            return None
+        try:
+            color = self._read(self.color_files[position], self.color_reader)
+        except UnreadableImage:
+            return None
+        fits = color.shape[:2] == (self.calibration.camera.height, self.calibration.camera.width)
+        return look_at(position, int(self.stamps_ns[position]), self.calibration.rectification.color(color)) if fits else None
 
     def _read(self, path: Path, reader: Callable[[Path], Any]) -> Any:
         try:
@@ -165,6 +184,7 @@ def select_frames(sequence: ImageSequence, frames: str, place: str) -> ImageSequ
         color_files=sequence.color_files[part],
         depth_files=sequence.depth_files[part],
         numbers=numbers,
+        whole=sequence,
     )
 
 

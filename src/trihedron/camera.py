@@ -30,6 +30,8 @@ class Camera(types.Camera):
         depth_offset: added to inverse depths (1/m).
         depth_radial: relative error of depth in the corners of the image; it grows with the squared distance from the centre.
         depth_camera: the separate camera of depth images that are not registered to colour.
+        readout_s: seconds from the first row of colour to the last, of a rolling shutter; negative where the last is read first.
+        depth_readout_s: the same of depth.
 
     Raises:
         DataError: a number is one that no camera has, as a width of 0.
@@ -49,15 +51,17 @@ class Camera(types.Camera):
     depth_offset: float = 0.0
     depth_radial: float = 0.0
     depth_camera: DepthCamera | None = None
+    readout_s: float = 0.0
+    depth_readout_s: float = 0.0
 
     def __post_init__(self) -> None:
         if fault := calibration_fault(self.calibration):
-            raise DataError("camera", fault, "give the numbers of a calibration, in pixels")
+            raise DataError("camera", fault, "give the numbers of a calibration, in pixels and seconds")
 
     @classmethod
     def from_yaml(cls, path: str | Path) -> Camera:
         """Read a camera file: `width height fx fy cx cy depth_scale [distortion] [fps] [depth_noise] [depth_offset]
-        [depth_radial] [depth_camera] [sigmas]`.
+        [depth_radial] [depth_camera] [readout_s] [depth_readout_s] [sigmas]`.
 
         Args:
             path: the file, one `key: value` a line; ~ is the home folder.
@@ -107,4 +111,5 @@ class Camera(types.Camera):
     def calibration(self) -> Calibration:
         """The camera as the readers of data sets have it."""
         pinhole = types.Camera(**{field.name: getattr(self, field.name) for field in fields(types.Camera)})
-        return Calibration(pinhole, self.depth_scale, tuple(self.distortion), self.depth_offset, self.depth_radial, self.depth_camera)
+        own = {field.name: getattr(self, field.name) for field in fields(Calibration) if field.name != "camera"}
+        return Calibration(**own | {"camera": pinhole, "distortion": tuple(self.distortion)})

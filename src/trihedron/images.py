@@ -16,12 +16,14 @@ from trihedron.pipeline.record.trajectories import parse_stamp_ns
 
 
 class Frames:
-    """Makes frames of arrays: copied, in metres, undistorted. Raises DataError naming the argument."""
+    """Makes frames of arrays: copied, in metres, undistorted, without the skew of a rolling shutter as far as frames come one after the other. Raises
+    DataError naming the argument."""
 
     def __init__(self, camera: Camera) -> None:
         self.camera = camera
         self._calibration = camera.calibration
         self._rectification = self._calibration.rectification
+        self._steady = self._calibration.steady_frames(lambda number: None)  # by the frames before
 
     def __call__(self, index: int, stamp_ns: int, rgb: object | None, depth: object | None) -> Frame:
         """Make frame `index` of rgb (h, w, 3) uint8 and depth (h, w), in metres or uint16 / depth_scale. None is a missing image: black, or without
@@ -30,7 +32,8 @@ class Frames:
         color = self._color(rgb) if rgb is not None else np.zeros((*size, 3), np.uint8)
         depth_m = self._depth(depth) if depth is not None else np.zeros(size, np.float32)
         color, depth_m = self._rectification.color(color), self._rectification.depth(depth_m)
-        return Frame(index, stamp_ns, color, depth_m, self._calibration.camera)
+        frame = Frame(index, stamp_ns, color, depth_m, self._calibration.camera)
+        return frame if self._steady is None else self._steady(index, frame)
 
     def _color(self, given: object) -> U8:
         image = np.asarray(given)

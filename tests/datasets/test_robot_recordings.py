@@ -18,6 +18,7 @@ from rosbags.rosbag2.enums import CompressionMode
 
 from trihedron.datasets.readers.folder import Folder
 from trihedron.datasets.readers.mcap import McapDataset
+from trihedron.datasets.readers.rolling_shutter import SteadyFrames, look_at
 from trihedron.pipeline.app.cli import main
 from trihedron.pipeline.core.errors import DataError, RecordingError
 from trihedron.pipeline.core.geometry import invert
@@ -312,6 +313,20 @@ def test_a_camera_file_describes_the_images_as_they_come_without_it(tmp_path: Pa
     (tmp_path / "camera.yaml").write_text(yaml.safe_dump(beside))
     moved = McapDataset(path=str(path), camera=str(tmp_path / "camera.yaml"))(1)
     assert np.allclose(moved.depth_m[:, :-5], frames[0].depth_m[:, 5:], rtol=1e-6)
+
+
+def test_the_skew_of_a_rolling_shutter_is_removed_from_a_recording_as_from_a_folder(tmp_path: Path) -> None:
+    path = write_file(tmp_path / "robot.mcap", registered(4))
+    width, height = WALL.size
+    camera = {"width": width, "height": height, "fx": 90.0, "fy": 90.0, "cx": 40.0, "cy": 30.0, "depth_scale": 1000.0, "readout_s": 0.05}
+    (tmp_path / "camera.yaml").write_text(yaml.safe_dump(camera))
+    read, steady = McapDataset(path=str(path)), McapDataset(path=str(path), camera=str(tmp_path / "camera.yaml"))
+    frames = [read(k) for k in range(4)]
+    looks = {k: look_at(k, frame.stamp_ns, frame.color) for k, frame in enumerate(frames)}
+    expected = SteadyFrames(steady.calibration().camera, 0.05, 0.0, looks.get)
+    assert all(np.array_equal(steady(k).color, expected(k, frames[k]).color) for k in (3, 0, 1, 2))
+    assert not np.array_equal(steady(2).color, frames[2].color)
+    assert np.array_equal(steady(2).depth_m, frames[2].depth_m)
 
 
 def test_a_camera_file_of_another_size_is_one_line(tmp_path: Path) -> None:

@@ -69,8 +69,9 @@ def make_seeds(folder: Path) -> None:
     (folder / "list_rgb.txt").write_text("# colour\n" + "".join(f"1305031102.{k}75304 rgb/1305031102.{k}75304.png\n" for k in range(4)))
     (folder / "associations.txt").write_text("".join(f"{k} depth/{k}.png {k} rgb/{k}.png\n" for k in range(1, 4)))
     (folder / "camera_short.yaml").write_text("width: 64\nheight: 48\nfx: 60.0\nfy: 60.0\ncx: 31.5\ncy: 23.5\ndepth_scale: 5000\n")
-    more = "fps: 20\ndepth_noise: exact\ndepth_offset: 0.01\ndistortion: {k1: 0.1, k2: -0.2, p1: 0, p2: 1e-3, k3: 0}\n"
+    more = "fps: 20\ndepth_noise: {b: 0.005, floor_m: 0.002}\ndepth_offset: 0.01\ndistortion: {k1: 0.1, k2: -0.2, p1: 0, p2: 1e-3, k3: 0}\n"
     more += "depth_radial: -0.01\ndepth_camera: {fx: 61, fy: 61, cx: 32, cy: 24, translation_m: [0.025, 0, 0], rotation_deg: [0, 0.5, 0]}\n"
+    more += "readout_s: 0.03\ndepth_readout_s: -0.01\nsigmas: {focal: 0.001}\n"
     (folder / "camera_long.yaml").write_text((folder / "camera_short.yaml").read_text() + more)
     camera = {"w": 1200, "h": 680, "fx": 600.0, "fy": 600.0, "cx": 599.5, "cy": 339.5, "scale": 6553.5}
     (folder / "cam_params.json").write_text(json.dumps({"camera": camera}))

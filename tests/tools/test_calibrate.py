@@ -46,7 +46,7 @@ def run(folder, out, *more):
     return Recording(out / "run.mcap")
 
 
-def with_parameters(used, edges=(0.0,) * 6, pairs=(0.0,) * 5):
+def with_parameters(used, edges=(0.0,) * 6, pairs=(0.0,) * 6):
     nothing = np.zeros(6), np.zeros(6)
     return with_estimates(used, Estimates(np.array(edges), np.array(pairs), nothing, nothing, {}))
 
@@ -63,13 +63,14 @@ def test_a_recommended_camera_projects_depth_where_the_edges_are():
     center = np.array([320.0, 240.0])
     expected = np.exp(edges[0]) * (pixel - center) + edges[1:3] + 585.0 * edges[3:5] / z + center
     for focal in (1.0, factor):
-        found = with_parameters(Calibration(CAMERA, 1000.0), edges, (np.log(focal), 0.01, 0.0, 0.03, 0.0))
+        found = with_parameters(Calibration(CAMERA, 1000.0), edges, (np.log(focal), 0.01, 0.0, 0.03, 0.0, 0.02))
         depth, color = found.depth_camera, found.camera
         ray = (pixel - [depth.cx, depth.cy]) / [depth.fx, depth.fy]
         point = np.append(ray * z, z) + depth.translation_m
         assert np.allclose(color.project(point[None])[0], expected, atol=1e-9)
-        assert np.isclose(color.fx, 585.0 * focal) and found.depth_offset == 0.01
-    again = with_parameters(found, (0.05, 1.0, 2.0, 0.01, 0.0, 0.0))
+        assert np.isclose(color.fx, 585.0 * focal) and found.depth_offset == 0.01 and (found.readout_s, found.depth_readout_s) == (0.03, 0.02)
+    again = with_parameters(found, (0.05, 1.0, 2.0, 0.01, 0.0, 0.0), (0.0, 0.0, 0.0, -0.004, 0.0, 0.0))
+    assert np.isclose(again.readout_s, 0.026)
     registered = color.project(point[None])[0]
     expected = np.exp(0.05) * (registered - center) + [1.0, 2.0] + color.fx * np.array([0.01, 0.0]) / z + center
     point = np.append((pixel - [again.depth_camera.cx, again.depth_camera.cy]) / again.depth_camera.fx * z, z) + again.depth_camera.translation_m
@@ -79,7 +80,7 @@ def test_a_recommended_camera_projects_depth_where_the_edges_are():
 @pytest.mark.parametrize("noise", [DepthNoise(), EXACT_DEPTH, NOISES["stereo"], DepthNoise(0.001, 0.002, 0.003, 0.004)])
 def test_the_file_that_is_written_is_read_back(tmp_path, noise):
     depth = DepthCamera(589.137, 589.137, 314.246, 244.402, (-0.04075, 0.00441, 0.0), (0.1, 0.0, -0.2))
-    given = Calibration(replace(CAMERA, depth_noise=noise), 1000.0, (0.1, 0.0, 0.0, 0.0, 0.0), 0.012, -0.01, depth)
+    given = Calibration(replace(CAMERA, depth_noise=noise), 1000.0, (0.1, 0.0, 0.0, 0.0, 0.0), 0.012, -0.01, depth, 0.0304, -0.015)
     (tmp_path / "camera.yaml").write_text(yaml.safe_dump(keys_of(given)))
     assert read_camera_file(tmp_path / "camera.yaml") == given
 
