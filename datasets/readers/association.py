@@ -6,6 +6,7 @@ import logging
 import os
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,7 @@ from trihedron.pipeline.core.geometry import nearest_pairs
 from trihedron.pipeline.record.trajectories import parse_stamp_ns, table_lines
 
 log = logging.getLogger("trihedron")
+LEAST_PAIRED = 0.9  # of the images that the stamps alone pair
 Stamps = NDArray[np.int64]
 
 
@@ -79,23 +81,43 @@ def associate(first_ns: Stamps, second_ns: Stamps, max_difference_ns: int) -> ND
     return nearest_pairs(first_ns, second_ns, max_difference_ns - 1)
 
 
+def pairs_with_delay(color_ns: Stamps, depth_ns: Stamps, max_difference_ns: int, known_delay_s: float) -> NDArray[np.int64]:
+    """Pair as `associate` does, depth that was taken `known_delay_s` after its stamps; by the stamps alone where few images are so near then, as at a
+    low rate: depth is turned to the time of its colour."""
+    known_ns = round(known_delay_s * 1e9)
+    by_stamps, by_times = (associate(color_ns, depth_ns + later_ns, max_difference_ns) for later_ns in (0, known_ns))
+    return by_times if len(by_times) >= LEAST_PAIRED * len(by_stamps) else by_stamps
+
+
 def count_unpaired(folder: Path, colors: int, pairs: int, where: str = "") -> None:
     """Warn of colour images that have no depth image, which are skipped."""
     if pairs < colors:
         log.warning("%s: %d of the %d colour images have no depth image%s; they are skipped", folder, colors - pairs, colors, where)
 
 
-def listed_pairs(folder: Path, max_difference_ms: float, depth_delay_ms: float) -> tuple[Stamps, list[Path], list[Path]]:
-    """The pairs of rgb.txt and depth.txt, by time: stamps of colour, colour files, depth files. Depth is taken `depth_delay_ms` later than its
-    stamps say. Raises DataError where a list is missing or nothing pairs."""
+class ListedPairs(NamedTuple):
+    """Pairs of images: stamps of colour (n,), colour files, depth files, and by how many ns the stamp of depth is later (n,)."""
+
+    stamps_ns: Stamps
+    color_files: list[Path]
+    depth_files: list[Path]
+    depth_later_ns: Stamps
+
+
+def listed_pairs(folder: Path, max_difference_ms: float, depth_delay_ms: float, known_delay_s: float) -> ListedPairs:
+    """Pair the images of rgb.txt and depth.txt by time. Stamps of depth are `depth_delay_ms` later than they say, and it was taken `known_delay_s`
+    after that. Raises DataError where a list is missing or nothing pairs."""
     for name, kind in (("rgb.txt", "colour"), ("depth.txt", "depth")):
         if not (folder / name).is_file():
             raise DataError(str(folder / name), "is missing", f"it lists the {kind} images; without lists use dataset=folder")
     lists = [read_file_list(folder / name) for name in ("rgb.txt", "depth.txt")]
     color, depth = (without_missing(listed, folder / name) for listed, name in zip(lists, ("rgb.txt", "depth.txt")))
-    pairs = associate(color.stamps_ns, depth.stamps_ns + round(depth_delay_ms * 1e6), round(max_difference_ms * 1e6))
+    depth_ns = depth.stamps_ns + round(depth_delay_ms * 1e6)
+    pairs = pairs_with_delay(color.stamps_ns, depth_ns, round(max_difference_ms * 1e6), known_delay_s)
     if not len(pairs):
         cause = f"no colour and depth image are within {max_difference_ms:g} ms of each other"
         raise DataError(str(folder), cause, "check the stamps in rgb.txt and depth.txt or raise dataset.max_difference_ms")
     count_unpaired(folder, len(color.files), len(pairs), f" within {max_difference_ms:g} ms")
-    return color.stamps_ns[pairs[:, 0]], [color.files[i] for i in pairs[:, 0]], [depth.files[i] for i in pairs[:, 1]]
+    first, second = pairs.T
+    later_ns = depth_ns[second] - color.stamps_ns[first]
+    return ListedPairs(color.stamps_ns[first], [color.files[i] for i in first], [depth.files[i] for i in second], later_ns)

@@ -10,6 +10,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from trihedron.datasets.readers.images import MAX_PIXELS
 from trihedron.datasets.readers.registration import DepthCamera, Rectification
 from trihedron.datasets.readers.rolling_shutter import Look, SteadyFrames
@@ -20,18 +23,19 @@ from trihedron.pipeline.core.value_checks import camera_fault
 
 CAMERA_FILE = "camera.yaml"
 REQUIRED = ("width", "height", "fx", "fy", "cx", "cy", "depth_scale")
-OPTIONAL = ("distortion", "fps", "depth_noise", "depth_offset", "depth_radial", "depth_camera", "readout_s", "depth_readout_s", "sigmas")
+TIMES = ("readout_s", "depth_readout_s", "depth_delay_s")
+OPTIONAL = ("distortion", "fps", "depth_noise", "depth_offset", "depth_radial", "depth_camera", *TIMES, "sigmas")
 SMALLEST_SCALE, LARGEST_SCALE = 1e-6, 1e9  # outside, single precision overflows
 LARGEST_COEFFICIENT = 100.0  # of a distortion; those of lenses are below 10
 LARGEST_RADIAL = 0.5
-LONGEST_READOUT_S = 0.1  # 1/30 s for most cameras
+LEAST_LATER_NS = 1_000_000  # between the stamps of depth and colour where it matters
+LONGEST_S = 0.2  # of times; a readout takes 1/30 s at most in most cameras
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")
 LARGEST_NOISE = 10.0  # of each coefficient: no sensor measures so badly
-# of a Kinect (the first) or an Xtion: 20 to 32 ms (see `datasets.simulation.sensor_models`), for both of its cameras
-KINECT_READOUT_S = 0.026
-KINECT = CalibrationSigmas(readout_s=0.004, depth_readout_s=0.004)
+# of both cameras of a Kinect: the least of the 20 to 32 ms that are published (`datasets.simulation.sensor_models`), so that none is turned too far
+KINECT_READOUT_S = 0.02
 # of a Kinect whose two cameras are taken to be usual ones: so far those of the TUM benchmark are from 525 px and the image's centre, root mean square
-USUAL_KINECT = replace(KINECT, focal=0.017, centre=0.013, depth_focal=0.017, registration=0.013)
+USUAL_KINECT = CalibrationSigmas(focal=0.017, centre=0.013, depth_focal=0.017, registration=0.013)
 SHORT = "give dataset.camera=tum_fr1, tum_fr2, tum_fr3, icl_nuim or a camera.yaml"
 
 
@@ -53,7 +57,8 @@ NOISES = {
 class Calibration:
     """The pinhole camera of a reader's frames, and the conversion of its files: depth file value per metre, lens distortion of both images
     (k1 k2 p1 p2 k3 of Brown's model, as OpenCV orders them; empty = none), what is added to inverse depths (1/m), the relative error of depth in the
-    corners of the image, the separate camera of depth images that are not registered to colour, and the readout times (s) of rolling shutters."""
+    corners of the image, the separate camera of depth images that are not registered to colour, the readout times (s) of
+    rolling shutters, and by how much depth is taken later than its stamp, or than colour where it has none (s)."""
 
     camera: Camera
     depth_scale: float
@@ -63,20 +68,28 @@ class Calibration:
     depth_camera: DepthCamera | None = None
     readout_s: float = 0.0
     depth_readout_s: float = 0.0
+    depth_delay_s: float = 0.0
 
     @cached_property
     def rectification(self) -> Rectification:
         """The conversion of an image by itself."""
         return Rectification(self.camera, self.distortion, self.depth_offset, self.depth_radial, self.depth_camera)
 
-    def steady_frames(self, read: Callable[[int], Look | None]) -> SteadyFrames | None:
-        """Return what removes the skew of rolling shutters, None where there are none; `read` returns the look of any frame."""
-        return SteadyFrames(self.camera, self.readout_s, self.depth_readout_s, read) if self.readout_s or self.depth_readout_s else None
+    def steady_frames(self, read: Callable[[int], Look | None], later_ns: NDArray[np.int64] | None = None) -> SteadyFrames | None:
+        """Return what brings all rows of a frame to one time, None where they are. `read` returns the look of any frame; `later_ns` is by how much
+        the stamp of depth of each frame is later than that of colour."""
+        differ = later_ns is not None and bool((np.abs(later_ns) > LEAST_LATER_NS).any())
+        if not (self.readout_s or self.depth_readout_s or self.depth_delay_s or differ):
+            return None
+
+        def depth_later_s(number: int) -> float:
+            return self.depth_delay_s + (float(later_ns[number]) / 1e9 if later_ns is not None else 0.0)
+
+        return SteadyFrames(self.camera, self.readout_s, self.depth_readout_s, read, depth_later_s)
 
 
 def _kinect(fx: float, fy: float, cx: float, cy: float, *distortion: float) -> Calibration:
-    camera = Camera(640, 480, fx, fy, cx, cy, sigmas=KINECT)
-    return Calibration(camera, 5000.0, distortion, readout_s=KINECT_READOUT_S, depth_readout_s=KINECT_READOUT_S)
+    return Calibration(Camera(640, 480, fx, fy, cx, cy), 5000.0, distortion, readout_s=KINECT_READOUT_S, depth_readout_s=KINECT_READOUT_S)
 
 
 PRESETS = {
@@ -104,18 +117,19 @@ FOLDER_NAMES = {  # how the published archives are called
 }
 
 
-def choose_calibration(folder: Path, choice: str, default: str = "") -> Calibration:
+def choose_calibration(folder: Path, choice: str, default: str = "", readout_s: float = 0.0) -> Calibration:
     """The calibration of a folder of images: `choice` (a preset's name or a camera file), else the folder's camera.yaml, else the preset
-    its name speaks of, else the preset `default`. Raises DataError when none fits or the file is wrong."""
+    its name speaks of, else the preset `default`; a file that does not state them has the readout times `readout_s`. Raises DataError when none fits
+    or the file is wrong."""
     if choice in PRESETS:
         return PRESETS[choice]
     if choice:
         given = Path(choice).expanduser()
         if not given.exists():
             raise DataError("dataset.camera", f"'{choice}' is neither a file nor a preset", did_you_mean(choice, PRESETS))
-        return read_camera_file(given / CAMERA_FILE if given.is_dir() else given)
+        return read_camera_file(given / CAMERA_FILE if given.is_dir() else given, readout_s)
     if (folder / CAMERA_FILE).is_file():
-        return read_camera_file(folder / CAMERA_FILE)
+        return read_camera_file(folder / CAMERA_FILE, readout_s)
     name = folder.resolve().name.lower()
     matching = (preset for preset, pattern in FOLDER_NAMES.items() if re.search(pattern, name))
     preset = next(matching, default)
@@ -124,10 +138,11 @@ def choose_calibration(folder: Path, choice: str, default: str = "") -> Calibrat
     return PRESETS[preset]
 
 
-def read_camera_file(path: Path) -> Calibration:
+def read_camera_file(path: Path, readout_s: float = 0.0) -> Calibration:
     """Read a camera.yaml: `width height fx fy cx cy depth_scale [distortion k1 k2 p1 p2 k3] [fps]
     [depth_noise kinect|stereo|exact, or a_m b c_per_m floor_m] [depth_offset] [depth_radial]
-    [depth_camera fx fy cx cy [translation_m] [rotation_deg]] [readout_s] [depth_readout_s] [sigmas]`.
+    [depth_camera fx fy cx cy [translation_m] [rotation_deg]] [readout_s] [depth_readout_s] [depth_delay_s] [sigmas]`.
+    Where it states no readout times both are `readout_s`, of exact depth, which was rendered, 0.
 
     Raises DataError naming file and key."""
     try:
@@ -146,11 +161,11 @@ def read_camera_file(path: Path) -> Calibration:
     missing = next((key for key in REQUIRED if key not in content), None)
     if missing is not None:
         raise DataError(str(path), f"the key '{missing}' is missing", f"give {' '.join(REQUIRED)}")
-    return _calibration(path, content)
+    return _calibration(path, content, readout_s)
 
 
-def _calibration(path: Path, content: dict[str, Any]) -> Calibration:
-    optional = ("fps", "depth_offset", "depth_radial", "readout_s", "depth_readout_s")
+def _calibration(path: Path, content: dict[str, Any], readout_s: float) -> Calibration:
+    optional = ("fps", "depth_offset", "depth_radial", *TIMES)
     values = {key: _number(path, key, content[key]) for key in (*REQUIRED, *optional) if key in content}
     if values["fy"] < 0.0:
         raise DataError(str(path), "fy is negative (y up)", "give it positive; dataset=icl_nuim reflects the published poses itself")
@@ -170,9 +185,10 @@ def _calibration(path: Path, content: dict[str, Any]) -> Calibration:
         raise DataError(
             str(path), f"depth_radial is {_printable_value(content['depth_radial'])}", f"give a relative error within ±{LARGEST_RADIAL:g}"
         )
-    readouts = values.get("readout_s", 0.0), values.get("depth_readout_s", 0.0)
+    usual_s = 0.0 if noise == EXACT_DEPTH else readout_s
+    times = (values.get(key, usual) for key, usual in zip(TIMES, (usual_s, usual_s, 0.0)))
     distortion, depth_camera = _distortion(path, content.get("distortion")), _depth_camera(path, content.get("depth_camera"))
-    calibration = Calibration(camera, values["depth_scale"], distortion, offset, radial, depth_camera, *readouts)
+    calibration = Calibration(camera, values["depth_scale"], distortion, offset, radial, depth_camera, *times)
     if fault := calibration_fault(calibration):
         raise DataError(str(path), fault, "give the numbers of a calibration, in pixels and seconds")
     return calibration
@@ -186,9 +202,9 @@ def calibration_fault(found: Calibration) -> str:
         return f"depth_scale is not within {SMALLEST_SCALE:g} … {LARGEST_SCALE:g}"
     if not all(abs(coefficient) <= LARGEST_COEFFICIENT for coefficient in found.distortion):
         return f"distortion holds coefficients that are not within ±{LARGEST_COEFFICIENT:g}"
-    for key in ("readout_s", "depth_readout_s"):
-        if not abs(getattr(found, key)) <= LONGEST_READOUT_S:
-            return f"{key} is not within ±{LONGEST_READOUT_S:g}"
+    for key in TIMES:
+        if not abs(getattr(found, key)) <= LONGEST_S:
+            return f"{key} is not within ±{LONGEST_S:g}"
     if (depth := found.depth_camera) is not None:
         fault = camera_fault(replace(found.camera, fx=depth.fx, fy=depth.fy, cx=depth.cx, cy=depth.cy))
     return f"depth_camera.{fault}" if fault else ""

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from trihedron.datasets.readers.association import Stamps, associate, count_unpaired
+from trihedron.datasets.readers.association import Stamps, count_unpaired, pairs_with_delay
 from trihedron.datasets.readers.cameras import choose_calibration, with_noise
 from trihedron.datasets.readers.matrices import MAX_DIGITS
 from trihedron.datasets.readers.sequence import ImageSequence, SequenceReader
@@ -45,11 +45,11 @@ class Folder(SequenceReader):
     def _open(self, folder: Path) -> ImageSequence:
         colors, depths = _images(folder, COLOR_FOLDERS, "colour"), _images(folder, DEPTH_FOLDERS, "depth")
         found = len(colors)
-        names, colors, depths = _pair(folder, colors, depths, round(self.max_difference_ms * 1e6))
-        count_unpaired(folder, found, len(colors))
         calibration = with_noise(choose_calibration(folder, self.camera), self.exact_depth)
+        names, colors, depths, later_ns = _pair(folder, colors, depths, round(self.max_difference_ms * 1e6), calibration.depth_delay_s)
+        count_unpaired(folder, found, len(colors))
         truth = read_trajectory(folder / TRUTH) if (folder / TRUTH).is_file() else None
-        return ImageSequence(_stamps(names, calibration.camera.fps), colors, depths, calibration, truth)
+        return ImageSequence(_stamps(names, calibration.camera.fps), colors, depths, calibration, truth, depth_later_ns=later_ns)
 
 
 def _images(folder: Path, names: tuple[str, ...], kind: str) -> list[Path]:
@@ -69,26 +69,31 @@ def _natural(file: Path) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdecimal() and len(part) <= MAX_NAME else (-1, part) for part in re.findall(r"\d+|\D+", file.stem)]
 
 
-def _pair(folder: Path, colors: list[Path], depths: list[Path], max_difference_ns: int) -> tuple[list[str], list[Path], list[Path]]:
-    """Names, colour and depth files of the pairs: by equal names; else by time; else by the number that ends a name; else by order."""
+def _pair(
+    folder: Path, colors: list[Path], depths: list[Path], max_difference_ns: int, delay_s: float
+) -> tuple[list[str], list[Path], list[Path], Stamps | None]:
+    """Names, colour and depth files of the pairs: by equal names; else by time, with the ns by which the stamp of depth is later than that of colour;
+    else by the number that ends a name; else by order."""
     by_name = {file.stem: file for file in depths}
     common = [file for file in colors if file.stem in by_name]
     if common:
-        return [file.stem for file in common], common, [by_name[file.stem] for file in common]
+        return [file.stem for file in common], common, [by_name[file.stem] for file in common], None
     names = [file.stem for file in colors]
     if all(SECONDS.fullmatch(file.stem) for file in colors + depths):
-        pairs = associate(_stamps(names, 1.0), _stamps([file.stem for file in depths], 1.0), max_difference_ns)
-        if len(pairs):
-            return [names[i] for i in pairs[:, 0]], [colors[i] for i in pairs[:, 0]], [depths[i] for i in pairs[:, 1]]
+        color_ns, depth_ns = _stamps(names, 1.0), _stamps([file.stem for file in depths], 1.0)
+        first, second = pairs_with_delay(color_ns, depth_ns, max_difference_ns, delay_s).T
+        if len(first):
+            later_ns = depth_ns[second] - color_ns[first]
+            return [names[i] for i in first], [colors[i] for i in first], [depths[i] for i in second], later_ns
     color_numbers, depth_numbers = _numbers(colors), _numbers(depths)
     shared = sorted(color_numbers.keys() & depth_numbers.keys())
     if shared:
-        return [str(n) for n in shared], [color_numbers[n] for n in shared], [depth_numbers[n] for n in shared]
+        return [str(n) for n in shared], [color_numbers[n] for n in shared], [depth_numbers[n] for n in shared], None
     if len(colors) != len(depths):
         cause = f"{len(colors)} colour and {len(depths)} depth images have no name in common"
         raise DataError(str(folder), cause, "give the two images of a pair the same name")
     _warn_of_times(folder, names, [file.stem for file in depths])
-    return names, colors, depths
+    return names, colors, depths, None
 
 
 def _warn_of_times(folder: Path, colors: list[str], depths: list[str]) -> None:

@@ -47,7 +47,7 @@ class McapDataset:
     depth_info_topic: str = ""  # likewise of depth
     truth_from: str = ""  # a topic of poses (/mocap/pose), or the frame the transforms of the camera begin from (map); empty = no truth
     max_difference_ms: PositiveFloat = 20.0  # of the stamps of a pair of colour and depth
-    depth_delay_ms: float = 0.0  # depth is taken this much later than its stamps; trihedron calibrate estimates it
+    depth_delay_ms: float = 0.0  # by which the stamps of depth are early, for pairing
     depth_scale: PositiveFloat = 1000.0  # of 16-bit depth: values per metre; that of a camera file takes its place
     camera: str = ""  # camera.yaml of the images undistorted and registered by what the recording states; empty = as that states
 
@@ -61,8 +61,8 @@ class McapDataset:
         if not file.complete:
             log.warning("%s is cut off; what is whole of it is read", file.path)
         topics = Topics(self.color_topic, self.depth_topic, self.color_info_topic, self.depth_info_topic, self.truth_from)
-        depth_scale = self.depth_scale if self._given is None else self._given.depth_scale
-        return RobotRecording(file, topics, round(self.max_difference_ms * 1e6), round(self.depth_delay_ms * 1e6), depth_scale)
+        depth_scale, known_delay_s = (self.depth_scale, 0.0) if self._given is None else (self._given.depth_scale, self._given.depth_delay_s)
+        return RobotRecording(file, topics, round(self.max_difference_ms * 1e6), round(self.depth_delay_ms * 1e6), depth_scale, known_delay_s)
 
     @cached_property
     def _given(self) -> Calibration | None:
@@ -89,7 +89,10 @@ class McapDataset:
 
     @cached_property
     def _steady(self) -> SteadyFrames | None:
-        return self._given.steady_frames(self._look) if self._given is not None else None
+        if self._given is None:
+            return None
+        later_ns = self._frames.depth_later_ns if isinstance(self._frames, RobotRecording) and self._given.depth_delay_s else None
+        return self._given.steady_frames(self._look, later_ns)
 
     def _look(self, position: int) -> Look | None:
         """The look of a frame of the recording; None where there is none, or none that can be read."""

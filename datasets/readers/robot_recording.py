@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from trihedron.datasets.readers.association import Stamps, associate
+from trihedron.datasets.readers.association import Stamps, pairs_with_delay
 from trihedron.datasets.readers.picture_headers import UnreadableImage
 from trihedron.datasets.readers.pixels import Kind, color_of, depth_of
 from trihedron.datasets.readers.registration import Registration, Undistortion
@@ -56,6 +56,7 @@ class RobotRecording:
     max_difference_ns: int
     depth_delay_ns: int
     depth_scale: float
+    known_delay_s: float = 0.0  # of depth, in a pair by stamps alone
 
     def __len__(self) -> int:
         return len(self._pairs)
@@ -64,9 +65,14 @@ class RobotRecording:
         """Return the stamp of a frame, that of its colour image."""
         return int(self._pairs[position, 0])
 
+    @property
+    def depth_later_ns(self) -> Stamps:
+        """By how many ns the stamp of depth is later (n,), beyond the median of pairs by stamps alone, with which a known delay was estimated."""
+        return self._pairs[:, 3]
+
     def frame(self, position: int) -> Frame | None:
         """The pair at a place; None, after a warning, where one of its images cannot be decoded."""
-        stamp_ns, color_row, depth_row = self._pairs[position].tolist()
+        stamp_ns, color_row, depth_row, _ = self._pairs[position].tolist()
         try:
             color = self._decode_image(self._color, color_row, self._first_color.shape)
             depth = self._decode_image(self._depth, depth_row, self._first_depth.shape)
@@ -110,13 +116,16 @@ class RobotRecording:
 
     @cached_property
     def _pairs(self) -> Stamps:
-        """(n, 3) stamp, row of colour, row of depth; in order of time."""
+        """(n, 4) stamp, row of colour, row of depth, and by how many ns the stamp of depth is later than in a usual pair; in order of time."""
         color, depth = _sort_stamps(self._color.stamps_ns()), _sort_stamps(self._depth.stamps_ns())
-        pairs = associate(color[:, 0], depth[:, 0] + self.depth_delay_ns, self.max_difference_ns)
+        depth_ns = depth[:, 0] + self.depth_delay_ns
+        usual, pairs = (pairs_with_delay(color[:, 0], depth_ns, self.max_difference_ns, known_s) for known_s in (0.0, self.known_delay_s))
         if not len(pairs):
             cause = f"no image of {self._color.topic} is within {self.max_difference_ns / 1e6:g} ms of one of {self._depth.topic}"
             raise DataError(str(self.file.path), cause, "raise dataset.max_difference_ms or give dataset.depth_delay_ms")
-        return np.column_stack([color[pairs[:, 0]], depth[pairs[:, 1], 1]])
+        first, second = pairs.T
+        apart_ns, usual_ns = (depth_ns[those[:, 1]] - color[those[:, 0], 0] for those in (pairs, usual))
+        return np.column_stack([color[first], depth[second, 1], apart_ns - (round(float(np.median(usual_ns))) if len(usual) else 0)])
 
     @cached_property
     def _color_intrinsics(self) -> Intrinsics:

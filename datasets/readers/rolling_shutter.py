@@ -53,14 +53,22 @@ def look_at(number: int, stamp_ns: int, color: U8) -> Look:
 
 
 class SteadyFrames:
-    """Frames of a camera with all rows at one time, whichever are asked for, from any thread.
+    """Frames of a camera with all rows at one time, that of the middle row of colour, whichever are asked for, from any thread.
 
     `readout_s` is the time from the first row of colour to the last, negative where the last is read first; `depth_readout_s` the same of depth.
     `read(number)` returns the look of another frame, None where there is none. An image that repeats the last one is turned back as that was, and
-    stays equal to it."""
+    stays equal to it. The middle row of depth was `depth_later_s(number)` after that of colour."""
 
-    def __init__(self, camera: Camera, readout_s: float, depth_readout_s: float, read: Callable[[int], Look | None]) -> None:
-        self._camera, self._readout_s, self._depth_readout_s, self._read = camera, readout_s, depth_readout_s, read
+    def __init__(
+        self,
+        camera: Camera,
+        readout_s: float,
+        depth_readout_s: float,
+        read: Callable[[int], Look | None],
+        depth_later_s: Callable[[int], float] = lambda number: 0.0,
+    ) -> None:
+        self._camera, self._readout_s, self._depth_readout_s = camera, readout_s, depth_readout_s
+        self._read, self._depth_later_s = read, depth_later_s
         self._looks: dict[int, Look | None] = {}  # of the last frames that were asked for
         self._shown: dict[int, Look] = {}  # the same, of the frame that first showed the image
         self._turns: dict[tuple[int, int], F64 | None] = {}  # between two frames
@@ -68,7 +76,7 @@ class SteadyFrames:
         self._lock = threading.Lock()
 
     def __call__(self, number: int, frame: Frame) -> Frame:
-        """Return frame `number` as if all rows had been read with the middle one; as it was where the rate of turning is not known."""
+        """Return frame `number` as if all rows had been read with the middle one of colour; as it was where the rate of turning is not known."""
         with self._lock:
             _keep(self._looks, number, look_at(number, frame.stamp_ns, frame.color))
             shown = self._first_shown(number)
@@ -77,18 +85,18 @@ class SteadyFrames:
             rate = self._rates[shown.number] if shown is not None else None
         if rate is None:
             return frame
-        color = self._turned_back(frame.color, rate, self._readout_s, cv2.INTER_LINEAR, cv2.BORDER_REPLICATE)
-        depth_m = self._turned_back(frame.depth_m, rate, self._depth_readout_s, cv2.INTER_NEAREST, cv2.BORDER_CONSTANT)
+        color = self._turned_back(frame.color, rate, self._readout_s, 0.0, cv2.INTER_LINEAR, cv2.BORDER_REPLICATE)
+        depth_m = self._turned_back(frame.depth_m, rate, self._depth_readout_s, self._depth_later_s(number), cv2.INTER_NEAREST, cv2.BORDER_CONSTANT)
         return replace(frame, color=color, depth_m=depth_m)
 
-    def _turned_back(self, image: NDArray[Any], rate: F64, readout_s: float, interpolation: int, border: int) -> NDArray[Any]:
-        """The image with all rows at the time of the middle one; as it was where no row would move by a twentieth of a pixel, or where
+    def _turned_back(self, image: NDArray[Any], rate: F64, readout_s: float, later_s: float, interpolation: int, border: int) -> NDArray[Any]:
+        """The image with all rows `later_s` before the time of its middle one; as it was where no row would move by a twentieth of a pixel, or where
         one would turn too far to be seen."""
         camera = self._camera
-        if abs(readout_s) * norm(rate) * max(camera.fx, camera.fy) < 2.0 * STILL_PX:
+        if (0.5 * abs(readout_s) + abs(later_s)) * norm(rate) * max(camera.fx, camera.fy) < STILL_PX:
             return image
         turned, columns = np.empty_like(image), np.arange(camera.width, dtype=np.float32)
-        start, slope = row_lines(camera, rate, readout_s)
+        start, slope = row_lines(camera, rate, readout_s, later_s)
         if not min(start[:, 2].min(), (start[:, 2] + columns[-1] * slope[:, 2]).min()) > LEAST_FACTOR:
             return image
         for first in range(0, camera.height, BLOCK_ROWS):
@@ -176,13 +184,14 @@ def rotation_between(first: U8, second: U8, camera: Camera, readout: float) -> F
     return turn
 
 
-def row_lines(camera: Camera, rate: F64, readout_s: float) -> tuple[F32, F32]:
-    """Locate the rows of an image of one moment, that of the middle row, in the image that was read row by row while the camera turned.
+def row_lines(camera: Camera, rate: F64, readout_s: float, later_s: float = 0.0) -> tuple[F32, F32]:
+    """Locate the rows of an image of one moment in the image that was read row by row while the camera turned.
 
     Args:
         camera: of the images.
         rate: (3,) rad/s; directions in the camera's frame turn by `rate × time`.
         readout_s: from the first row to the last.
+        later_s: from the moment to the middle row.
 
     Returns:
         (h, 3) homogeneous pixel of the image that was read for the first pixel of each row, and (h, 3) what each further one adds. The third
@@ -191,7 +200,7 @@ def row_lines(camera: Camera, rate: F64, readout_s: float) -> tuple[F32, F32]:
     rows = np.arange(camera.height)
     # a row that moves while the image is read, by -fy rate[0] t in the middle, is read that much earlier or later
     slower = max(1.0 + readout_s * camera.fy * float(rate[0]) / camera.height, 0.1)
-    times_s = readout_s / slower * ((rows + 0.5) / camera.height - 0.5)
+    times_s = (later_s + readout_s * ((rows + 0.5) / camera.height - 0.5)) / slower
     angle = norm(rate)
     axis = skew(rate / angle)
     turned, turned_twice = matmul(camera.K, axis, inv(camera.K)), matmul(camera.K, axis, axis, inv(camera.K))  # Rodrigues' formula

@@ -40,8 +40,8 @@ DepthReader = Callable[[Path], F32]
 @dataclass(frozen=True)
 class ImageSequence:
     """Pairs of files with their stamps, read as frames. `numbers` are those of the pairs in the whole data set, which is `whole` where these are a
-    part of it; `depth_reader` replaces the reading of 16-bit images, `color_reader` that of colour. Frames are not cached: memory does not grow
-    with the sequence."""
+    part of it, and has `depth_later_ns`, by how much the stamp of each depth image is later than that of colour; `depth_reader` replaces the reading
+    of 16-bit images, `color_reader` that of colour. Frames are not cached: memory does not grow with the sequence."""
 
     stamps_ns: NDArray[np.int64]
     color_files: Sequence[Path]
@@ -52,6 +52,7 @@ class ImageSequence:
     depth_reader: DepthReader | None = None
     color_reader: Callable[[Path], U8] = read_color
     whole: ImageSequence | None = None
+    depth_later_ns: NDArray[np.int64] | None = None
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
@@ -72,7 +73,8 @@ class ImageSequence:
 
     @cached_property
     def _steady(self) -> SteadyFrames | None:
-        return self.calibration.steady_frames((self.whole or self)._look)
+        whole = self.whole or self
+        return self.calibration.steady_frames(whole._look, whole.depth_later_ns)
 
     def _look(self, position: int) -> Look | None:
         """The look of a frame of the whole data set; None where there is none, or none that can be read."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from trihedron.datasets.readers.cameras import Calibration, choose_calibration
+from trihedron.datasets.readers.cameras import KINECT_READOUT_S, Calibration, choose_calibration
 from trihedron.datasets.readers.images import read_depth
 from trihedron.datasets.readers.matrices import files_by_number, frame_stamps, pose_files
 from trihedron.datasets.readers.sequence import DepthReader, ImageSequence, SequenceReader
@@ -37,7 +37,7 @@ class SevenScenes(SequenceReader):
         if not numbers:
             inside = sorted(entry.name for entry in folder.glob("seq-*") if entry.is_dir())
             raise DataError(str(folder), "holds no frames of 7-Scenes", f"choose one of {', '.join(inside)}" if inside else LAYOUT)
-        calibration = choose_calibration(folder, self.camera, default="seven_scenes")
+        calibration = choose_calibration(folder, self.camera, "seven_scenes", KINECT_READOUT_S)
         stamps = frame_stamps(numbers, calibration.camera.fps)
         truth = pose_files(stamps, [folder / f"frame-{n:06}.pose.txt" for n in numbers])
         if truth is not None and calibration.depth_camera is not None:

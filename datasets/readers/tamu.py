@@ -20,8 +20,9 @@ class Tamu(SequenceReader):
 
     camera: str = ""  # preset or camera.yaml; empty = the folder's file
     max_difference_ms: PositiveFloat = 20.0  # of a pair's stamps
-    depth_delay_ms: float = 0.0  # depth is taken this much later than its stamps; trihedron calibrate estimates it
+    depth_delay_ms: float = 0.0  # depth is taken this much later than its stamps, and by depth_delay_s of the camera file
 
     def _open(self, folder: Path) -> ImageSequence:
         calibration = choose_calibration(folder, self.camera)
-        return ImageSequence(*listed_pairs(folder, self.max_difference_ms, self.depth_delay_ms), calibration)
+        pairs = listed_pairs(folder, self.max_difference_ms, self.depth_delay_ms, calibration.depth_delay_s)
+        return ImageSequence(*pairs[:3], calibration, depth_later_ns=pairs.depth_later_ns)

@@ -16,8 +16,7 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from trihedron.pipeline.core.config import make_plugin
-from trihedron.pipeline.core.errors import ConfigError, DataError
+from trihedron.pipeline.core.errors import ConfigError
 from trihedron.pipeline.core.files import write_file
 from trihedron.pipeline.core.overrides import literal_text, quote
 from trihedron.pipeline.core.registry import load_plugins, options_of, plugins_of
@@ -25,7 +24,6 @@ from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.run.run_folder import CONFIG, CURE
 
 UNCALIBRATED, CAMERA = "uncalibrated", "camera.yaml"  # in the run folder: what is tracked with the stated camera, and what is recommended
-LEAST_PAIRED = 0.9  # of the frames, with another delay of depth
 NEEDED = ("keypoints", "matches", "map")  # stages
 FIRST = {  # root keys of the first pass
     "calibrate": False,
@@ -44,11 +42,9 @@ REFUSED = {  # keys of a run whose sequence cannot be tracked twice from the beg
 
 @dataclass(frozen=True)
 class Recommendation:
-    """The changes that a recording recommends: the text of the new camera file, empty where the one in use stays; ms to add to the delay of depth;
-    and a line for each change."""
+    """The changes that a recording recommends: the text of the new camera file, empty where the one in use stays, and a line for each change."""
 
     camera: str
-    delay_ms: float
     changes: Sequence[str]
 
 
@@ -88,50 +84,23 @@ def uncalibrated(config: DictConfig, folder: Path, words: Sequence[str]) -> tupl
 def calibrated_config(config: DictConfig, out: Path) -> DictConfig:
     """Calibrate from the first pass in `out`, and write the camera file that is recommended. Returns the configuration with what is recommended, the
     one given where nothing is. Raises DataError for a recording that does not suffice."""
-    found, file, changed = recommendation(out / UNCALIBRATED), out / CAMERA, dict[str, Any]()
+    found, file = recommendation(out / UNCALIBRATED), out / CAMERA
     file.unlink(missing_ok=True)
     for change in found.changes:
         print(f"calibrate: {change}")
-    if found.camera:
-        write_file(file, found.camera)
-        changed["camera"] = str(file)
-    if found.delay_ms:
-        delay_ms, obstacle = _delay_to_apply(config, found.delay_ms)
-        changed |= {} if obstacle else {"depth_delay_ms": delay_ms}
-        if obstacle:
-            print(f"calibrate: depth is {found.delay_ms:.1f} ms late, and stays so: {obstacle}")
-    if not changed:
-        print(f"calibrate: {'' if found.delay_ms else 'no change recommended, '}the run has the stated camera")
+    if not found.camera:
+        print("calibrate: no change recommended, the run has the stated camera")
         return config
-    print("calibrate: the run has " + " ".join(f"dataset.{key}={value}" for key, value in changed.items()))
+    write_file(file, found.camera)
+    print(f"calibrate: the run has dataset.camera={file}")
     config = config.copy()
-    for key, value in changed.items():
-        config.dataset[key] = literal_text(value) if isinstance(value, str) else value
+    config.dataset.camera = literal_text(str(file))
     return config
 
 
 def recommended_words(config: DictConfig) -> list[str]:
     """Return the words by which a run has what an earlier one with calibrate=true was recommended, by the configuration of that."""
-    return [f"dataset.{key}={quote(str(config.dataset[key]))}" for key in ("camera", "depth_delay_ms") if config.dataset.get(key)]
-
-
-def _delay_to_apply(config: DictConfig, more_ms: float) -> tuple[float, str]:
-    """Return the delay of depth with what is recommended, and why it is not applied, if it is not: frames lose their depth image where no other is
-    near enough in time."""
-    if "depth_delay_ms" not in config.dataset:
-        return 0.0, f"dataset={config.dataset.plugin} has no depth_delay_ms"
-    delayed = config.copy()
-    delayed.dataset.depth_delay_ms = round(config.dataset.depth_delay_ms + more_ms, 1)
-    frames, paired = _count_frames(config), _count_frames(delayed)
-    few = paired < LEAST_PAIRED * frames
-    return delayed.dataset.depth_delay_ms, f"with it {paired} of {frames} frames have a depth image within dataset.max_difference_ms" if few else ""
-
-
-def _count_frames(config: DictConfig) -> int:
-    try:
-        return len(make_plugin("dataset", config.dataset))
-    except DataError:  # no pairs at all
-        return 0
+    return [f"dataset.camera={quote(str(config.dataset.camera))}"] if config.dataset.get("camera") else []
 
 
 def recommendation(folder: Path) -> Recommendation:

@@ -54,8 +54,8 @@ class TimeOffsetCheck:
         side = "after" if offset_s > 0.0 else "before"
         return (
             f"depth was taken about {abs(1e3 * offset_s):.0f} ms {side} colour: by the camera's motion its edges fit those of colour {ratio:.1f} "
-            f"times better then; pair colour with the depth of its own time: add {1e3 * offset_s:.0f} to dataset.depth_delay_ms "
-            "(dataset=tum, tamu and mcap), or what trihedron calibrate estimates"
+            f"times better then; pair colour with the depth of its own time: add {offset_s:.2f} to depth_delay_s of camera.yaml, or what trihedron "
+            "calibrate estimates"
         )
 
 

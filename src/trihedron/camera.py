@@ -32,6 +32,7 @@ class Camera(types.Camera):
         depth_camera: the separate camera of depth images that are not registered to colour.
         readout_s: seconds from the first row of colour to the last, of a rolling shutter; negative where the last is read first.
         depth_readout_s: the same of depth.
+        depth_delay_s: seconds by which depth is taken after colour.
 
     Raises:
         DataError: a number is one that no camera has, as a width of 0.
@@ -53,6 +54,7 @@ class Camera(types.Camera):
     depth_camera: DepthCamera | None = None
     readout_s: float = 0.0
     depth_readout_s: float = 0.0
+    depth_delay_s: float = 0.0
 
     def __post_init__(self) -> None:
         if fault := calibration_fault(self.calibration):
@@ -61,7 +63,7 @@ class Camera(types.Camera):
     @classmethod
     def from_yaml(cls, path: str | Path) -> Camera:
         """Read a camera file: `width height fx fy cx cy depth_scale [distortion] [fps] [depth_noise] [depth_offset]
-        [depth_radial] [depth_camera] [readout_s] [depth_readout_s] [sigmas]`.
+        [depth_radial] [depth_camera] [readout_s] [depth_readout_s] [depth_delay_s] [sigmas]`.
 
         Args:
             path: the file, one `key: value` a line; ~ is the home folder.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +32,17 @@ def test_a_camera_file_says_everything(tmp_path: Path) -> None:
 def test_depth_noise_is_that_of_a_sensor_or_given_in_numbers(tmp_path: Path, text: str, sigma_m: float) -> None:
     (tmp_path / "camera.yaml").write_text(GOOD + f"depth_noise: {text}\n")
     assert read_camera_file(tmp_path / "camera.yaml").camera.depth_noise.sigma_m(2.0) == pytest.approx(sigma_m, rel=1e-6)
+
+
+def test_readout_times_are_those_of_the_reader_unless_the_file_states_them(tmp_path: Path) -> None:
+    def times(text: str, usual_s: float) -> tuple[float, float, float]:
+        (tmp_path / "camera.yaml").write_text(GOOD + text)
+        found = read_camera_file(tmp_path / "camera.yaml", usual_s)
+        return found.readout_s, found.depth_readout_s, found.depth_delay_s
+
+    assert times("", 0.0) == (0.0, 0.0, 0.0) and times("", 0.02) == (0.02, 0.02, 0.0)
+    assert times("readout_s: 0\ndepth_delay_s: -0.004\n", 0.02) == (0.0, 0.02, -0.004)
+    assert times("depth_noise: exact\n", 0.02) == (0.0, 0.0, 0.0)  # rendered
 
 
 @pytest.mark.parametrize("text", ["[0.1, 0.2, 0.3, 0.4, 5e-1]", "0.1 0.2 0.3 0.4 0.5", "0.1, 0.2, 0.3, 0.4, 0.5"])
@@ -69,7 +80,7 @@ def test_a_camera_file_states_how_well_its_calibration_is_known(tmp_path: Path) 
 
 def test_a_rendered_data_set_states_that_its_camera_is_exact() -> None:
     assert set(asdict(choose_calibration(Path(), "icl_nuim").camera.sigmas).values()) == {0.0}
-    assert choose_calibration(Path(), "tum_fr3").camera.sigmas == replace(CalibrationSigmas(), readout_s=0.004, depth_readout_s=0.004)
+    assert choose_calibration(Path(), "tum_fr3").camera.sigmas == CalibrationSigmas()
 
 
 BAD = [
@@ -100,8 +111,9 @@ BAD = [
         )
         for key, value in (("floor_m", 0), ("c_per_m", 11.5))
     ),
-    (GOOD + "readout_s: 26\n", "{}: readout_s is not within ±0.1; give the numbers of a calibration, in pixels and seconds"),
-    (GOOD + "depth_readout_s: -0.2\n", "{}: depth_readout_s is not within ±0.1; give the numbers of a calibration, in pixels and seconds"),
+    (GOOD + "readout_s: 26\n", "{}: readout_s is not within ±0.2; give the numbers of a calibration, in pixels and seconds"),
+    (GOOD + "depth_readout_s: -0.25\n", "{}: depth_readout_s is not within ±0.2; give the numbers of a calibration, in pixels and seconds"),
+    (GOOD + "depth_delay_s: 15\n", "{}: depth_delay_s is not within ±0.2; give the numbers of a calibration, in pixels and seconds"),
     (GOOD + "readout_s: slow\n", "{}: readout_s is 'slow'; give a finite number"),
     (GOOD + "readout_ms: 26\n", "{}: unknown key 'readout_ms'; did you mean 'readout_s'?"),
     (GOOD + "depth_radial: 0.6\n", "{}: depth_radial is 0.6; give a relative error within ±0.5"),

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trihedron.datasets.readers.association import associate
+from trihedron.datasets.readers.association import associate, pairs_with_delay
 from trihedron.pipeline.core.lie import exp_se3
 from trihedron.pipeline.core.types import Trajectory
 from trihedron.pipeline.record.trajectories import format_stamp, parse_stamp_ns, read_trajectory, write_trajectory
@@ -61,3 +61,10 @@ def test_blank_lines_comments_tabs_and_commas_are_understood(tmp_path: Path) -> 
     found = read_trajectory(tmp_path / "t.txt")
     assert found.stamps_ns.tolist() == [1_500_000_000]
     np.testing.assert_array_equal(found.poses[0], [[1, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]])
+
+
+def test_a_known_delay_pairs_the_images_of_one_time_unless_that_loses_many() -> None:
+    stamps = 100 * np.arange(20)
+    assert pairs_with_delay(stamps, stamps, 30, 100e-9).tolist() == [[k + 1, k] for k in range(19)]  # depth of a frame later
+    assert pairs_with_delay(stamps, stamps, 30, 40e-9).tolist() == [[k, k] for k in range(20)]  # none is within 30 ns
+    assert pairs_with_delay(stamps, stamps, 30, 300e-9).tolist() == [[k, k] for k in range(20)]  # three of twenty

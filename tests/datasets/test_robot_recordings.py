@@ -329,6 +329,19 @@ def test_the_skew_of_a_rolling_shutter_is_removed_from_a_recording_as_from_a_fol
     assert np.array_equal(steady(2).depth_m, frames[2].depth_m)
 
 
+def test_a_delay_of_the_camera_file_pairs_the_images_of_one_time(tmp_path: Path) -> None:
+    path = write_file(tmp_path / "robot.mcap", registered(20))
+    width, height = WALL.size
+    camera = {"width": width, "height": height, "fx": 90.0, "fy": 90.0, "cx": 40.0, "cy": 30.0, "depth_scale": 1000.0}
+    stated = McapDataset(path=str(path))
+    period_s = (stated(1).stamp_ns - stated(0).stamp_ns) / 1e9
+    (tmp_path / "camera.yaml").write_text(yaml.safe_dump(camera | {"depth_delay_s": -period_s}))
+    given = McapDataset(path=str(path), camera=str(tmp_path / "camera.yaml"))
+    assert len(given) == 19
+    for k in (3, 0, 18):
+        assert np.array_equal(given(k).color, stated(k).color) and np.array_equal(given(k).depth_m, stated(k + 1).depth_m)
+
+
 def test_a_camera_file_of_another_size_is_one_line(tmp_path: Path) -> None:
     path = write_file(tmp_path / "robot.mcap", registered())
     (tmp_path / "camera.yaml").write_text("width: 640\nheight: 480\nfx: 500\nfy: 500\ncx: 320\ncy: 240\ndepth_scale: 1000\n")

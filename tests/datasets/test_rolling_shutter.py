@@ -15,6 +15,7 @@ from trihedron.camera import Camera
 from trihedron.datasets.readers.cameras import PRESETS
 from trihedron.datasets.readers.folder import Folder
 from trihedron.datasets.readers.rolling_shutter import LONGEST_S, SteadyFrames, look_at, rotation_between, row_lines
+from trihedron.datasets.readers.tum import Tum
 from trihedron.datasets.simulation import simulated_sensor
 from trihedron.datasets.simulation.simulated_sensor import SimulatedSensor
 from trihedron.datasets.simulation.synthetic import Synthetic
@@ -201,7 +202,32 @@ def test_an_absurd_focal_length_is_no_error(seen: Callable[[float], list[Frame]]
     assert np.isfinite(found.depth_m).all() and (found.depth_m >= 0.0).all()
 
 
+def test_depth_with_stamps_of_its_own_is_turned_to_the_time_of_its_colour(seen: Callable[[float], list[Frame]], tmp_path: Path) -> None:
+    """Colour of every second frame with the depth of the one after it, as the lists say: turned, depth is nearer to that of the colour's time."""
+    frames, period_s, later_s = seen(0.0), 0.07, 0.033
+    for name in ("rgb", "depth"):
+        (tmp_path / name).mkdir()
+    for k in range(0, COUNT, 2):
+        write_frame(tmp_path, k // 2, replace(frames[k], depth_m=frames[k + 1].depth_m))
+
+    def images(stated_s: float, delay_s: float) -> list[Frame]:
+        for name, offset_s in (("rgb", 0.0), ("depth", stated_s)):
+            lines = [f"{100.0 + k * period_s + offset_s:.6f} {name}/{k:04d}.png\n" for k in range(COUNT // 2)]
+            (tmp_path / f"{name}.txt").write_text("".join(lines))
+        (tmp_path / "camera.yaml").write_text(camera_keys(frames[0].camera, 0.0) + f"depth_delay_s: {delay_s:.6f}\n")
+        reader = Tum(str(tmp_path), max_difference_ms=40.0)
+        return [frame for k in range(len(reader)) if (frame := reader(k)) is not None]
+
+    errors = []
+    for found in (images(0.0, 0.0), images(later_s, 0.0)):
+        z, truth = (np.array([frame.depth_m for frame in those])[:, 20:-20, 20:-20] for those in (found, frames[::2]))
+        errors.append(np.abs(z - truth)[(z > 0.0) & (truth > 0.0)].mean())
+    print(errors)
+    assert errors[1] < 0.6 * errors[0]
+    assert all(same(a, b) for a, b in zip(images(later_s, 0.0), images(later_s - 0.013, 0.013), strict=True))
+
+
 def test_published_kinects_have_a_rolling_shutter() -> None:
     assert {name: preset.readout_s for name, preset in PRESETS.items()} == {
-        "tum_fr1": 0.026, "tum_fr2": 0.026, "tum_fr3": 0.026, "seven_scenes": 0.026, "icl_nuim": 0.0,
+        "tum_fr1": 0.02, "tum_fr2": 0.02, "tum_fr3": 0.02, "seven_scenes": 0.02, "icl_nuim": 0.0,
     }  # fmt: skip

@@ -32,6 +32,7 @@ def write_folder(folder, frames, focal=1.0):
     write_trajectory(folder / "groundtruth.txt", room.truth())
     camera = room(0).camera
     stated = {"fx": focal * camera.fx, "fy": focal * camera.fy, "cx": camera.cx, "cy": camera.cy, "width": 320, "height": 240, "depth_scale": 5000}
+    stated |= {"readout_s": 0, "depth_readout_s": 0}
     (folder / "camera.yaml").write_text(yaml.safe_dump({key: float(value) for key, value in stated.items()}))
     return camera.fx
 
@@ -105,7 +106,7 @@ def test_a_right_camera_stays_and_the_result_is_that_of_a_plain_run(right, tmp_p
 
 def test_jobs_of_sweeps_calibrate(right, tmp_path, monkeypatch):
     text = (right / "camera.yaml").read_text()
-    monkeypatch.setattr(calibrated_run, "recommendation", lambda folder: Recommendation(text, 0.0, ["a change"]))
+    monkeypatch.setattr(calibrated_run, "recommendation", lambda folder: Recommendation(text, ["a change"]))
     words = ["dataset=tum", f"dataset.path={right}", "calibrate=true,false", f"out={tmp_path}", "hydra/launcher=basic"]
     assert main(["run", "-m", *words]) == 0
     assert (tmp_path / "0" / "uncalibrated" / "run.mcap").exists() and (tmp_path / "0" / "camera.yaml").read_text() == text
@@ -114,25 +115,6 @@ def test_jobs_of_sweeps_calibrate(right, tmp_path, monkeypatch):
     table = th.compare(tmp_path)
     rows = table if isinstance(table, list) else table.to_dict("records")
     assert [row["change"] for row in rows] == ["calibrate=True", "calibrate=False"]
-
-
-def test_the_delay_of_depth_is_applied_where_the_data_set_has_one(right, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(calibrated_run, "recommendation", lambda folder: Recommendation("", 4.26, []))
-    words = [f"dataset.path={right}", "calibrate=true", "dataset.frames=0:3"]
-    assert main(["run", "dataset=tum", *words, "dataset.depth_delay_ms=1", f"out={tmp_path / 'a'}"]) == 0
-    assert "calibrate: the run has dataset.depth_delay_ms=5.3\n" in capsys.readouterr().out
-    configs = [read(folder / ".hydra" / "config.yaml")["dataset"]["depth_delay_ms"] for folder in (tmp_path / "a" / "uncalibrated", tmp_path / "a")]
-    assert configs == [1.0, 5.3] and not (tmp_path / "a" / "camera.yaml").exists()
-    assert main(["run", "dataset=folder", *words, f"out={tmp_path / 'b'}"]) == 0
-    line = "calibrate: depth is 4.3 ms late, and stays so: dataset=folder has no depth_delay_ms\n"
-    assert f"{line}calibrate: the run has the stated camera\n" in capsys.readouterr().out
-
-
-def test_a_delay_that_leaves_frames_without_depth_is_not_applied(right, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(calibrated_run, "recommendation", lambda folder: Recommendation("", 40.0, []))
-    assert main(["run", "dataset=tum", f"dataset.path={right}", "calibrate=true", f"out={tmp_path}"]) == 0
-    line = "calibrate: depth is 40.0 ms late, and stays so: with it 0 of 12 frames have a depth image within dataset.max_difference_ms\n"
-    assert line in capsys.readouterr().out and read(tmp_path / ".hydra" / "config.yaml")["dataset"]["depth_delay_ms"] == 0.0
 
 
 @pytest.mark.parametrize("words, line", [

@@ -12,7 +12,7 @@ from trihedron.pipeline.run.time_offset_check import TimeOffsetCheck
 
 LATE = (
     "depth was taken about 100 ms before colour: by the camera's motion its edges fit those of colour 1.5 times better then; pair "
-    "colour with the depth of its own time: add -100 to dataset.depth_delay_ms (dataset=tum, tamu and mcap), or what trihedron calibrate estimates"
+    "colour with the depth of its own time: add -0.10 to depth_delay_s of camera.yaml, or what trihedron calibrate estimates"
 )
 
 
@@ -38,7 +38,7 @@ def test_late_depth_is_named_once():
 
 def test_early_depth_is_named():
     (message,) = found(-3)
-    assert message.startswith("depth was taken about 80 ms after colour: ") and "add 80 to dataset.depth_delay_ms" in message
+    assert message.startswith("depth was taken about 80 ms after colour: ") and "add 0.08 to depth_delay_s of camera.yaml" in message
 
 
 def test_depth_that_lies_elsewhere_is_not_called_late():

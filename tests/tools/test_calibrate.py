@@ -37,6 +37,7 @@ def write_tum(folder, frames, color_at, depth_at, offset=0.0):
         (folder / f"{kind}.txt").write_text("\n".join(lines) + "\n")
     camera = color_at(0).camera
     content = {key: float(getattr(camera, key)) for key in ("fx", "fy", "cx", "cy")} | {"width": 640, "height": 480, "depth_scale": 5000}
+    content |= {"readout_s": 0.0, "depth_readout_s": 0.0}
     (folder / "camera.yaml").write_text(yaml.safe_dump(content))
     return content
 
@@ -80,7 +81,7 @@ def test_a_recommended_camera_projects_depth_where_the_edges_are():
 @pytest.mark.parametrize("noise", [DepthNoise(), EXACT_DEPTH, NOISES["stereo"], DepthNoise(0.001, 0.002, 0.003, 0.004)])
 def test_the_file_that_is_written_is_read_back(tmp_path, noise):
     depth = DepthCamera(589.137, 589.137, 314.246, 244.402, (-0.04075, 0.00441, 0.0), (0.1, 0.0, -0.2))
-    given = Calibration(replace(CAMERA, depth_noise=noise), 1000.0, (0.1, 0.0, 0.0, 0.0, 0.0), 0.012, -0.01, depth, 0.0304, -0.015)
+    given = Calibration(replace(CAMERA, depth_noise=noise), 1000.0, (0.1, 0.0, 0.0, 0.0, 0.0), 0.012, -0.01, depth, 0.0304, -0.015, 0.0123)
     (tmp_path / "camera.yaml").write_text(yaml.safe_dump(keys_of(given)))
     assert read_camera_file(tmp_path / "camera.yaml") == given
 
@@ -123,18 +124,18 @@ def test_a_camera_that_is_right_is_left_alone(tmp_path, capsys):
 
 @pytest.mark.slow
 def test_late_depth_is_recommended_for_the_data_set(tmp_path, capsys):
-    """Depth of three frames before: the run warns, the delay is recommended, and no camera file would mend it."""
+    """Depth of three frames before: the run warns, the delay is recommended, and with it colour has the depth of its own time."""
     room = Synthetic(frames="0:120")
     write_tum(tmp_path / "room", 110, lambda k: room(k + 3), room)
     run(tmp_path / "room", tmp_path / "before", "outputs=[trajectory]")
     assert "depth was taken about 100 ms before colour: " in capsys.readouterr().err
-    assert main(["calibrate", str(tmp_path / "before")]) == 0
+    assert main(["calibrate", str(tmp_path / "before"), "--out", str(tmp_path / "camera.yaml")]) == 0
     printed = capsys.readouterr().out
     print(printed)
-    delay = re.search(
-        r"^recommended: add (-\d+\.\d) to dataset.depth_delay_ms \(dataset=tum, tamu and mcap\), or pair colour with the depth", printed, re.M
-    )
-    assert delay is not None and abs(float(delay[1]) + 100.0) < 15.0 and "no change recommended" not in printed
+    delay = re.search(r"^depth_delay_s: (-\d+\.\d+)$", printed, re.M)
+    assert delay is not None and abs(float(delay[1]) + 0.1) < 0.015 and "no change recommended" not in printed
+    run(tmp_path / "room", tmp_path / "after", "outputs=[trajectory]", f"dataset.camera={tmp_path / 'camera.yaml'}")
+    assert "depth was taken" not in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -90,4 +90,4 @@ def test_depth_that_is_registered_is_left_alone() -> None:
     judgements: dict[str, Judgement] = {}
     recommended, (everything, sigmas) = _by_edges(edges(False), judgements)
     print(judgements, everything, sigmas)
-    assert not recommended.any() and not judgements["registration"].recommended and not judgements["delay"].recommended
+    assert not recommended.any() and not judgements["registration"].recommended and not judgements["depth_delay_s"].recommended
