@@ -198,9 +198,8 @@ def _by_pairs(pairs: Pairs, judgements: dict[str, Judgement], has_ratio: bool) -
     everything = fit(pairs, range(len(calibration_pairs.NAMES)), scale)[0]
     chosen = fit(pairs, accepted, scale)[0].parameters
     recommended = np.where(np.isin(np.arange(len(chosen)), accepted), chosen, 0.0)
-    recommended[4] = 0.0
-    for name, readout in READOUTS.items():
-        recommended[readout] *= judgements[name].recommended
+    applied = [readout for name, readout in READOUTS.items() if judgements[name].recommended]
+    recommended[np.setdiff1d(SHUTTER, applied)] = 0.0
     return recommended, (everything.parameters, np.sqrt(np.diag(everything.covariance)))
 
 

@@ -7,9 +7,9 @@ A point observed at pixel p with depth z, in a row that was read `s = readout (r
 in the camera's frame, which moves with angular rate ω and velocity v. The reading was taken later by `delay`, and by its row's part of the readout of
 depth instead of s: z is the measured depth less that time times the rate at which the depth at a pixel changes as the camera moves. One factor is
 estimated for fx and fy: pixels are squarer than two factors would be known. The motion between the two frames of a pair is estimated with the
-parameters, so that an error of the trajectory does not enter. Residuals
-are pixels and inverse depth in the second frame, robust (Geman and McClure). The covariance is that of an M-estimator whose terms are blocks of pairs
-("sandwich": Huber, 1967), for what a calibration lacks is common to neighbouring pairs.
+parameters, so that an error of the trajectory does not enter. Residuals are pixels and inverse depth in the second frame, robust (Geman and McClure).
+The covariance is that of an M-estimator whose terms are blocks of pairs ("sandwich": Huber, 1967), for what a calibration lacks is common to
+neighbouring pairs.
 """
 
 from __future__ import annotations

@@ -84,8 +84,10 @@ def associate(first_ns: Stamps, second_ns: Stamps, max_difference_ns: int) -> ND
 def pairs_with_delay(color_ns: Stamps, depth_ns: Stamps, max_difference_ns: int, known_delay_s: float) -> NDArray[np.int64]:
     """Pair as `associate` does, depth that was taken `known_delay_s` after its stamps; by the stamps alone where few images are so near then, as at a
     low rate: depth is turned to the time of its colour."""
-    known_ns = round(known_delay_s * 1e9)
-    by_stamps, by_times = (associate(color_ns, depth_ns + later_ns, max_difference_ns) for later_ns in (0, known_ns))
+    by_stamps = associate(color_ns, depth_ns, max_difference_ns)
+    if not known_delay_s:
+        return by_stamps
+    by_times = associate(color_ns, depth_ns + round(known_delay_s * 1e9), max_difference_ns)
     return by_times if len(by_times) >= LEAST_PAIRED * len(by_stamps) else by_stamps
 
 
@@ -105,8 +107,8 @@ class ListedPairs(NamedTuple):
 
 
 def listed_pairs(folder: Path, max_difference_ms: float, depth_delay_ms: float, known_delay_s: float) -> ListedPairs:
-    """Pair the images of rgb.txt and depth.txt by time. Stamps of depth are `depth_delay_ms` later than they say, and it was taken `known_delay_s`
-    after that. Raises DataError where a list is missing or nothing pairs."""
+    """Pair the images of rgb.txt and depth.txt by time. `depth_delay_ms` is added to the stamps of depth, which was taken `known_delay_s` later
+    still. Raises DataError where a list is missing or nothing pairs."""
     for name, kind in (("rgb.txt", "colour"), ("depth.txt", "depth")):
         if not (folder / name).is_file():
             raise DataError(str(folder / name), "is missing", f"it lists the {kind} images; without lists use dataset=folder")

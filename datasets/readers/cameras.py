@@ -57,8 +57,8 @@ NOISES = {
 class Calibration:
     """The pinhole camera of a reader's frames, and the conversion of its files: depth file value per metre, lens distortion of both images
     (k1 k2 p1 p2 k3 of Brown's model, as OpenCV orders them; empty = none), what is added to inverse depths (1/m), the relative error of depth in the
-    corners of the image, the separate camera of depth images that are not registered to colour, the readout times (s) of
-    rolling shutters, and by how much depth is taken later than its stamp, or than colour where it has none (s)."""
+    corners of the image, the separate camera of depth images that are not registered to colour, the readout times (s) of rolling shutters, and by how
+    much depth is taken later than its stamp, or than colour where it has none (s)."""
 
     camera: Camera
     depth_scale: float

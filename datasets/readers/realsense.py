@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 
 from trihedron.datasets.readers.cameras import stereo_noise
+from trihedron.datasets.readers.registration import Undistortion
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.libraries import imports_of
 from trihedron.pipeline.core.options import Frames, PositiveInt, frame_range
@@ -117,12 +117,12 @@ class _Stream:
         baseline = self._library.option.stereo_baseline
         return stereo_noise(focal_px, 1e-3 * float(sensor.get_option(baseline))) if sensor.supports(baseline) else DepthNoise()
 
-    def _calibration(self, found: Any, noise: DepthNoise) -> tuple[Camera, Any]:
+    def _calibration(self, found: Any, noise: DepthNoise) -> tuple[Camera, Undistortion]:
         coefficients = np.array(found.coeffs, float)
         if coefficients.any() and str(found.model) != LENS:
             raise DataError("dataset=realsense", f"the distortion model '{found.model}' is not known", "choose a size whose colour is undistorted")
         camera = Camera(found.width, found.height, found.fx, found.fy, found.ppx, found.ppy, float(self._options.fps), noise)
-        return camera, coefficients if coefficients.any() else None
+        return camera, Undistortion(camera, tuple(coefficients.tolist()) if coefficients.any() else ())
 
     def _keep(self) -> None:
         """Take every pair as it comes and keep the newest."""
@@ -159,12 +159,7 @@ class _Stream:
         self._last_stamp = stamp_ns
         pixels = np.array(color.get_data(), np.uint8)
         depth_m = np.array(depth.get_data(), np.uint16).astype(np.float32) * np.float32(self._scale)
-        if self._lens is not None:
-            K, size = self._camera.K, (self._camera.width, self._camera.height)
-            maps = cv2.initUndistortRectifyMap(K, self._lens, np.eye(3), K, size, cv2.CV_32FC1)
-            pixels = np.asarray(cv2.remap(pixels, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8)
-            depth_m = np.asarray(cv2.remap(depth_m, *maps, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT), np.float32)
-        return Frame(number, stamp_ns, pixels, depth_m, self._camera)
+        return Frame(number, stamp_ns, self._lens.color(pixels), self._lens.depth(depth_m), self._camera)
 
     def end(self) -> None:
         running, self._running = self._running, False

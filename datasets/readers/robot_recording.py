@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from trihedron.datasets.readers.association import Stamps, pairs_with_delay
+from trihedron.datasets.readers.association import Stamps, associate, pairs_with_delay
 from trihedron.datasets.readers.picture_headers import UnreadableImage
 from trihedron.datasets.readers.pixels import Kind, color_of, depth_of
 from trihedron.datasets.readers.registration import Registration, Undistortion
@@ -119,7 +119,8 @@ class RobotRecording:
         """(n, 4) stamp, row of colour, row of depth, and by how many ns the stamp of depth is later than in a usual pair; in order of time."""
         color, depth = _sort_stamps(self._color.stamps_ns()), _sort_stamps(self._depth.stamps_ns())
         depth_ns = depth[:, 0] + self.depth_delay_ns
-        usual, pairs = (pairs_with_delay(color[:, 0], depth_ns, self.max_difference_ns, known_s) for known_s in (0.0, self.known_delay_s))
+        usual = associate(color[:, 0], depth_ns, self.max_difference_ns)
+        pairs = pairs_with_delay(color[:, 0], depth_ns, self.max_difference_ns, self.known_delay_s) if self.known_delay_s else usual
         if not len(pairs):
             cause = f"no image of {self._color.topic} is within {self.max_difference_ns / 1e6:g} ms of one of {self._depth.topic}"
             raise DataError(str(self.file.path), cause, "raise dataset.max_difference_ms or give dataset.depth_delay_ms")

@@ -85,14 +85,14 @@ class SteadyFrames:
             rate = self._rates[shown.number] if shown is not None else None
         if rate is None:
             return frame
-        color = self._turned_back(frame.color, rate, self._readout_s, 0.0, cv2.INTER_LINEAR, cv2.BORDER_REPLICATE)
-        depth_m = self._turned_back(frame.depth_m, rate, self._depth_readout_s, self._depth_later_s(number), cv2.INTER_NEAREST, cv2.BORDER_CONSTANT)
-        return replace(frame, color=color, depth_m=depth_m)
+        color = self._turned_back(frame.color, rate, self._readout_s, 0.0)
+        return replace(frame, color=color, depth_m=self._turned_back(frame.depth_m, rate, self._depth_readout_s, self._depth_later_s(number)))
 
-    def _turned_back(self, image: NDArray[Any], rate: F64, readout_s: float, later_s: float, interpolation: int, border: int) -> NDArray[Any]:
-        """The image with all rows `later_s` before the time of its middle one; as it was where no row would move by a twentieth of a pixel, or where
-        one would turn too far to be seen."""
-        camera = self._camera
+    def _turned_back(self, image: NDArray[Any], rate: F64, readout_s: float, later_s: float) -> NDArray[Any]:
+        """The image, of colour or depth, with all rows `later_s` before the time of its middle one; as it was where no row would move by a twentieth
+        of a pixel, or where one would turn too far to be seen."""
+        camera, is_depth = self._camera, image.ndim == 2
+        how, border = (cv2.INTER_NEAREST, cv2.BORDER_CONSTANT) if is_depth else (cv2.INTER_LINEAR, cv2.BORDER_REPLICATE)
         if (0.5 * abs(readout_s) + abs(later_s)) * norm(rate) * max(camera.fx, camera.fy) < STILL_PX:
             return image
         turned, columns = np.empty_like(image), np.arange(camera.width, dtype=np.float32)
@@ -102,8 +102,8 @@ class SteadyFrames:
         for first in range(0, camera.height, BLOCK_ROWS):
             block = slice(first, first + BLOCK_ROWS)
             x, y, z = (start[block, k, None] + slope[block, k, None] * columns for k in range(3))
-            cv2.remap(image, x / z, y / z, interpolation, dst=turned[block], borderMode=border)
-            if image.dtype == np.float32:
+            cv2.remap(image, x / z, y / z, how, dst=turned[block], borderMode=border)
+            if is_depth:
                 turned[block] /= z
         return turned
 
