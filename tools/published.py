@@ -9,6 +9,7 @@ from typing import Any
 
 import yaml
 
+LEAST_SHARE = 0.95  # of a sequence's frames; a reader skips those whose images are broken or repeated
 WHOLE = 0.9  # of a sequence's frames; with fewer the published figure is of something else
 
 
@@ -49,6 +50,7 @@ def published_ate_m(sequence: str, graph: str) -> float | None:
 
 
 def peer_figures(folder: str, frames: int) -> dict[str, dict[str, Any]]:
-    """Return the figures of other programs on a folder's first `frames` frames, by program; empty where they ran on other frames."""
-    cells = [name for name, entry in peers()["sequences"].items() if re.search(entry["folder"], folder) and entry["frames"] == frames]
+    """Return the figures of other programs on the frames of which `frames` were read, by program; empty where they ran on others."""
+    entries = {name: entry for name, entry in peers()["sequences"].items() if re.search(entry["folder"], folder)}
+    cells = [name for name, entry in entries.items() if LEAST_SHARE * entry["frames"] <= frames <= entry["frames"]]
     return {program: found[cell] for program, found in peers()["programs"].items() for cell in cells if cell in found}

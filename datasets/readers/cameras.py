@@ -34,6 +34,7 @@ COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")
 LARGEST_NOISE = 10.0  # of each coefficient: no sensor measures so badly
 # of both cameras of a Kinect: the least of the 20 to 32 ms that are published (`datasets.simulation.sensor_models`), so that none is turned too far
 KINECT_READOUT_S = 0.02
+ROUNDED_PX = 1.0  # a camera file may hold a published calibration's numbers rounded
 # of a Kinect whose two cameras are taken to be usual ones: so far those of the TUM benchmark are from 525 px and the image's centre, root mean square
 USUAL_KINECT = CalibrationSigmas(focal=0.017, centre=0.013, depth_focal=0.017, registration=0.013)
 SHORT = "give dataset.camera=tum_fr1, tum_fr2, tum_fr3, icl_nuim or a camera.yaml"
@@ -117,10 +118,10 @@ FOLDER_NAMES = {  # how the published archives are called
 }
 
 
-def choose_calibration(folder: Path, choice: str, default: str = "", readout_s: float = 0.0) -> Calibration:
+def choose_calibration(folder: Path, choice: str, default: str = "", readout_s: float | None = None) -> Calibration:
     """The calibration of a folder of images: `choice` (a preset's name or a camera file), else the folder's camera.yaml, else the preset
-    its name speaks of, else the preset `default`; a file that does not state them has the readout times `readout_s`. Raises DataError when none fits
-    or the file is wrong."""
+    its name speaks of, else the preset `default`; `readout_s` as `read_camera_file` takes it. Raises DataError when none fits or the file is
+    wrong."""
     if choice in PRESETS:
         return PRESETS[choice]
     if choice:
@@ -138,11 +139,12 @@ def choose_calibration(folder: Path, choice: str, default: str = "", readout_s: 
     return PRESETS[preset]
 
 
-def read_camera_file(path: Path, readout_s: float = 0.0) -> Calibration:
+def read_camera_file(path: Path, readout_s: float | None = None) -> Calibration:
     """Read a camera.yaml: `width height fx fy cx cy depth_scale [distortion k1 k2 p1 p2 k3] [fps]
     [depth_noise kinect|stereo|exact, or a_m b c_per_m floor_m] [depth_offset] [depth_radial]
     [depth_camera fx fy cx cy [translation_m] [rotation_deg]] [readout_s] [depth_readout_s] [depth_delay_s] [sigmas]`.
-    Where it states no readout times both are `readout_s`, of exact depth, which was rendered, 0.
+    Where it states no readout times both are `readout_s`; without it those of a Kinect where its numbers are, to a pixel, those that the TUM
+    benchmark publishes for one of its cameras, else 0. Of exact depth, which was rendered, they are 0.
 
     Raises DataError naming file and key."""
     try:
@@ -164,7 +166,7 @@ def read_camera_file(path: Path, readout_s: float = 0.0) -> Calibration:
     return _calibration(path, content, readout_s)
 
 
-def _calibration(path: Path, content: dict[str, Any], readout_s: float) -> Calibration:
+def _calibration(path: Path, content: dict[str, Any], readout_s: float | None) -> Calibration:
     optional = ("fps", "depth_offset", "depth_radial", *TIMES)
     values = {key: _number(path, key, content[key]) for key in (*REQUIRED, *optional) if key in content}
     if values["fy"] < 0.0:
@@ -185,13 +187,23 @@ def _calibration(path: Path, content: dict[str, Any], readout_s: float) -> Calib
         raise DataError(
             str(path), f"depth_radial is {_printable_value(content['depth_radial'])}", f"give a relative error within ±{LARGEST_RADIAL:g}"
         )
-    usual_s = 0.0 if noise == EXACT_DEPTH else readout_s
+    usual_s = 0.0 if noise == EXACT_DEPTH else readout_s if readout_s is not None else _published_readout_s(camera)
     times = (values.get(key, usual) for key, usual in zip(TIMES, (usual_s, usual_s, 0.0)))
     distortion, depth_camera = _distortion(path, content.get("distortion")), _depth_camera(path, content.get("depth_camera"))
     calibration = Calibration(camera, values["depth_scale"], distortion, offset, radial, depth_camera, *times)
     if fault := calibration_fault(calibration):
         raise DataError(str(path), fault, "give the numbers of a calibration, in pixels and seconds")
     return calibration
+
+
+def _published_readout_s(camera: Camera) -> float:
+    """Return the readout time of the preset whose camera this is, 0.0 for a camera that is of none."""
+
+    def numbers(of: Camera) -> tuple[float, ...]:
+        return of.width, of.height, of.fx, of.fy, of.cx, of.cy
+
+    same = (found for found in PRESETS.values() if np.allclose(numbers(camera), numbers(found.camera), rtol=0.0, atol=ROUNDED_PX))
+    return next((found.readout_s for found in same if found.depth_camera is None), 0.0)
 
 
 def calibration_fault(found: Calibration) -> str:

@@ -34,15 +34,20 @@ def test_depth_noise_is_that_of_a_sensor_or_given_in_numbers(tmp_path: Path, tex
     assert read_camera_file(tmp_path / "camera.yaml").camera.depth_noise.sigma_m(2.0) == pytest.approx(sigma_m, rel=1e-6)
 
 
-def test_readout_times_are_those_of_the_reader_unless_the_file_states_them(tmp_path: Path) -> None:
-    def times(text: str, usual_s: float) -> tuple[float, float, float]:
-        (tmp_path / "camera.yaml").write_text(GOOD + text)
+def test_readout_times_are_those_of_the_reader_or_of_a_published_camera_unless_the_file_states_them(tmp_path: Path) -> None:
+    def times(text: str, usual_s: float | None, camera: str = GOOD) -> tuple[float, float, float]:
+        (tmp_path / "camera.yaml").write_text(camera + text)
         found = read_camera_file(tmp_path / "camera.yaml", usual_s)
         return found.readout_s, found.depth_readout_s, found.depth_delay_s
 
-    assert times("", 0.0) == (0.0, 0.0, 0.0) and times("", 0.02) == (0.02, 0.02, 0.0)
+    assert times("", None) == (0.0, 0.0, 0.0) and times("", 0.02) == (0.02, 0.02, 0.0)
     assert times("readout_s: 0\ndepth_delay_s: -0.004\n", 0.02) == (0.0, 0.02, -0.004)
     assert times("depth_noise: exact\n", 0.02) == (0.0, 0.0, 0.0)  # rendered
+    fr3 = "width: 640\nheight: 480\nfx: 535.4\nfy: 539.2\ncx: 320\ncy: 248\ndepth_scale: 5000\n"
+    assert times("", None, fr3) == (0.02, 0.02, 0.0) and times("", 0.0, fr3) == (0.0, 0.0, 0.0)
+    assert times("readout_s: 0\n", None, fr3) == (0.0, 0.02, 0.0)
+    icl = "width: 640\nheight: 480\nfx: 481.2\nfy: 480.0\ncx: 319.5\ncy: 239.5\ndepth_scale: 1000\n"
+    assert times("", None, icl) == times("", None, fr3.replace("535.4", "537")) == (0.0, 0.0, 0.0)
 
 
 @pytest.mark.parametrize("text", ["[0.1, 0.2, 0.3, 0.4, 5e-1]", "0.1 0.2 0.3 0.4 0.5", "0.1, 0.2, 0.3, 0.4, 0.5"])

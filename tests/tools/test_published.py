@@ -5,7 +5,7 @@ import re
 import pytest
 
 from trihedron.tools import download
-from trihedron.tools.published import paper, peers, sequence_of, sequences
+from trihedron.tools.published import paper, peer_figures, peers, sequence_of, sequences
 
 
 def test_every_row_has_a_figure_for_each_system():
@@ -30,3 +30,9 @@ def test_every_sequence_can_be_downloaded_and_is_known_by_its_folder():
 @pytest.mark.parametrize("name", ["icl_office_rendered", "hololens_walk"])
 def test_folders_of_other_sequences_have_no_published_figure(name):
     assert sequence_of(name) is None and any(re.search(entry["folder"], name) for entry in peers()["sequences"].values())
+
+
+def test_other_programs_are_compared_where_a_twentieth_of_their_frames_is_skipped_at_most():
+    of_all = peer_figures("seven_scenes_kitchen", 160)
+    assert of_all["ORB-SLAM2"]["ate_m"] and peer_figures("seven_scenes_kitchen", 152) == of_all
+    assert peer_figures("seven_scenes_kitchen", 151) == peer_figures("seven_scenes_kitchen", 161) == {}
