@@ -128,7 +128,7 @@ def _execute(config: DictConfig, out: Path, overrides: list[str], began: float, 
                     warnings.summarise()
         if replay is not None:
             print(_replay_summary(replay, runner, timing))
-        _report(out, metrics, timing, write_models(out, runner, earlier))
+        _report(out, metrics, timing, write_models(out, runner, earlier), bool(config.calibrate))
     if failure is not None:
         raise failure
     return metrics
@@ -367,12 +367,12 @@ def _replay_summary(replay: Replay, runner: Runner, timing: dict[str, Any]) -> s
     return f"computed: {', '.join(counts) or 'nothing'}; the rest is read from {replay.recording.path}"
 
 
-def _report(out: Path, metrics: dict[str, Any], timing: dict[str, Any], surfaces: list[str]) -> None:
+def _report(out: Path, metrics: dict[str, Any], timing: dict[str, Any], surfaces: list[str], calibrated: bool) -> None:
     status = metrics.get("status", {})
     if status:
         print("frames: " + ", ".join(f"{count} {name}" for name, count in status.items() if count))
     if sigma := metrics.get("sigma"):
-        print(sigma_line(sigma, out))
+        print(sigma_line(sigma, out, calibrated))
     for name, reason in metrics.get("reasons", {}).items():
         print(f"{name}, most of them: {reason}")
     if live := timing.get("live"):

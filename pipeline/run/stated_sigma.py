@@ -20,6 +20,7 @@ NOISE, DRIFT, CALIBRATED, SCALED = "noise", "drift", "calibration", "depth_scale
 CAUSES = {NOISE: "noise of the measurements", DRIFT: "drift of the map", CALIBRATED: "the calibration", SCALED: "the scale of depth"}
 SEE_MORE = "turn slower, or give more light"
 MEASURE = "measure a length in the room, and state sigmas.depth_scale in camera.yaml"
+STATE_SIGMAS = "state how well the camera is known, as sigmas in camera.yaml"
 FEW = 0.5  # of the median number of features of the frames that are ok, below which a frame shows few
 
 
@@ -91,9 +92,11 @@ def dominant_cause(sigma: Mapping[str, Any]) -> str:
     return max(share, key=lambda cause: share[cause]) if share else ""
 
 
-def sigma_line(sigma: Mapping[str, Any], folder: Path) -> str:
-    """Return the line of a run that ends, of `StatedSigma.to_dict()` and its folder: σ, what dominates it, and what would improve it."""
-    cures = {NOISE: f": {SEE_MORE}", CALIBRATED: f": trihedron calibrate {shlex.quote(str(folder))}", SCALED: f": {MEASURE}"}
+def sigma_line(sigma: Mapping[str, Any], folder: Path, calibrated: bool = False) -> str:
+    """Return the line of a run that ends, of `StatedSigma.to_dict()` and its folder: σ, what dominates it, and what would improve it; of a run that
+    was `calibrated`, beyond that."""
+    calibrate = STATE_SIGMAS if calibrated else f"trihedron calibrate {shlex.quote(str(folder))}"
+    cures = {NOISE: f": {SEE_MORE}", CALIBRATED: f": {calibrate}", SCALED: f": {MEASURE}"}
     line = "σ of ok poses: " + ", ".join(f"{1e3 * sigma[f'{k}_m']:.1f} mm, {sigma[f'{k}_deg']:.2f}° ({k})" for k in ("median", "worst"))
     if cause := dominant_cause(sigma):
         line += f"; mostly {CAUSES[cause]}{cures.get(cause, '')}"

@@ -64,6 +64,11 @@ def test_what_dominates_is_said_with_its_cure(causes, said):
     assert line.partition("(worst)")[2] == said
 
 
+def test_a_calibrated_run_is_not_told_to_calibrate():
+    line = sigma_line(sigma_of([FIRST, pose(1.0, 2.0, 3.0)]).to_dict(), RUN, calibrated=True)
+    assert line.partition("(worst)")[2] == "; mostly the calibration: state how well the camera is known, as sigmas in camera.yaml"
+
+
 def test_the_scale_of_depth_is_a_cause_of_its_own():
     """0.5 % of 2 m, beside 3 mm of noise and 4 of drift."""
     moved = np.eye(4)
