@@ -19,7 +19,7 @@ SEQUENCES = {
     "textured room": (["dataset=synthetic"], 0.004),
     "bare room": (["dataset=synthetic", "dataset.texture=false"], 0.006),
     "start of a bare room": (["dataset=synthetic", "dataset.texture=false", "dataset.length=40"], 0.006),
-    "office": (["dataset=tum", f"dataset.path={DATA}/icl_office_rendered"], 0.004),
+    "office": (["dataset=tum", f"dataset.path={DATA}/icl_office_rendered"], 0.002),
 }
 
 
