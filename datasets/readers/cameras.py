@@ -197,13 +197,13 @@ def _calibration(path: Path, content: dict[str, Any], readout_s: float | None) -
 
 
 def _published_readout_s(camera: Camera) -> float:
-    """Return the readout time of the preset whose camera this is, 0.0 for a camera that is of none."""
-
-    def numbers(of: Camera) -> tuple[float, ...]:
-        return of.width, of.height, of.fx, of.fy, of.cx, of.cy
-
-    same = (found for found in PRESETS.values() if np.allclose(numbers(camera), numbers(found.camera), rtol=0.0, atol=ROUNDED_PX))
-    return next((found.readout_s for found in same if found.depth_camera is None), 0.0)
+    """Return the readout time of the preset that is calibrated with these numbers, 0.0 where none is. Of 7-Scenes, whose preset has two cameras, no
+    calibration was published."""
+    for preset in PRESETS.values():
+        given, published = ((of.width, of.height, *of.intrinsics) for of in (camera, preset.camera))
+        if preset.depth_camera is None and np.allclose(given, published, rtol=0.0, atol=ROUNDED_PX):
+            return preset.readout_s
+    return 0.0
 
 
 def calibration_fault(found: Calibration) -> str:

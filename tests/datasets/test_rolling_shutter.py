@@ -113,7 +113,6 @@ def test_frames_come_nearer_to_those_of_a_global_shutter(seen: Callable[[float],
             both = (z > 0.0) & (true_z > 0.0)
             color = np.abs(frame.color[20:-20, 20:-20].astype(float) - truth[k].color[20:-20, 20:-20])
             errors.append((color.mean(), np.median(np.abs(z[both] - true_z[both]))))
-        print(k, errors)
         assert errors[0][0] < 0.5 * errors[1][0] and errors[0][1] < 0.75 * errors[1][1]
 
 
@@ -222,7 +221,6 @@ def test_depth_with_stamps_of_its_own_is_turned_to_the_time_of_its_colour(seen: 
     for found in (images(0.0, 0.0), images(later_s, 0.0)):
         z, truth = (np.array([frame.depth_m for frame in those])[:, 20:-20, 20:-20] for those in (found, frames[::2]))
         errors.append(np.abs(z - truth)[(z > 0.0) & (truth > 0.0)].mean())
-    print(errors)
     assert errors[1] < 0.6 * errors[0]
     assert all(same(a, b) for a, b in zip(images(later_s, 0.0), images(later_s - 0.013, 0.013), strict=True))
 
