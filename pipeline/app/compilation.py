@@ -54,10 +54,10 @@ PARTS = {"tracking": TRACKING, "all": ALL, "wheel": WHEEL}
 LATER = "surfaces, loops, a loss and relocalisation"
 # What the line about compiling names, and how many functions both processes compile, about; numba's own are compiled by each
 SHOWN = {
-    "tracking": ("of tracking", 815),
-    "all": (f"of tracking, {LATER}", 955),
-    "later": (f"of {LATER}", 315),  # what `all` compiles after `tracking`
-    "wheel": ("of all that a wheel brings", 1030),
+    "tracking": ("of tracking", 675),
+    "all": (f"of tracking, {LATER}", 815),
+    "later": (f"of {LATER}", 210),  # what `all` compiles after `tracking`
+    "wheel": ("of all that a wheel brings", 865),
 }
 SHORT = 150  # frames of a run that hardly closes a loop
 STAGES = {"keypoints", "lines", "planes", "manhattan"}  # of the graphs that these runs compile most of

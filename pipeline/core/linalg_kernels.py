@@ -9,6 +9,52 @@ import numpy as np
 from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F64
 
+# In loops where numpy would take an expression: numba compiles a sum over an axis, or an assignment to a slice, for a second and more.
+
+
+@kernel
+def copy_matrix(A: F64, out: F64) -> None:
+    """Copy A (m, n) into `out`."""
+    for i in range(A.shape[0]):
+        for j in range(A.shape[1]):
+            out[i, j] = A[i, j]
+
+
+@kernel
+def sum_matrices(matrices: F64) -> F64:
+    """Sum (m, n) of matrices (k, m, n)."""
+    out = np.zeros((matrices.shape[1], matrices.shape[2]))
+    for k in range(len(matrices)):
+        add_matrix(matrices[k], out)
+    return out
+
+
+@kernel
+def add_matrix(A: F64, out: F64) -> None:
+    """Add A (m, n) to `out`."""
+    for i in range(A.shape[0]):
+        for j in range(A.shape[1]):
+            out[i, j] += A[i, j]
+
+
+@kernel
+def add_block(A: F64, out: F64, row: int, column: int) -> None:
+    """Add A (m, n) to the block of `out` that begins at (row, column)."""
+    for i in range(A.shape[0]):
+        for j in range(A.shape[1]):
+            out[row + i, column + j] += A[i, j]
+
+
+@kernel
+def split_pose(T: F64) -> tuple[F64, F64]:
+    """Rotation (3, 3) and position (3,) of a pose (4, 4)."""
+    R, t = np.empty((3, 3)), np.empty(3)
+    for i in range(3):
+        t[i] = T[i, 3]
+        for j in range(3):
+            R[i, j] = T[i, j]
+    return R, t
+
 
 @kernel
 def dot(a: F64, b: F64) -> float:
@@ -271,7 +317,7 @@ def factor_each(matrices: F64) -> bool:
     for p in range(len(matrices)):
         L = np.zeros(matrices[p].shape)
         positive &= factor_positive(matrices[p], L)
-        matrices[p] = L
+        copy_matrix(L, matrices[p])
     return positive
 
 
@@ -363,7 +409,7 @@ def eigh(A: F64) -> tuple[F64, F64]:
     """Return the eigenvalues (k,), increasing, and unit eigenvectors (k, k), in columns, of a symmetric A (k, k), of which the lower triangle is
     read."""
     copy = np.empty((1, len(A), len(A)))
-    copy[0] = A
+    copy_matrix(A, copy[0])
     values, vectors = eigh_each(copy)
     return values[0], vectors[0]
 
@@ -372,6 +418,8 @@ def eigh(A: F64) -> tuple[F64, F64]:
 def solve(A: F64, b: F64) -> F64:
     """Return x (k,) with `A x = b`, by elimination with row pivots; not finite where A is singular."""
     matrix, x = np.empty((1, len(A), len(A))), np.empty((1, len(A), 1))
-    matrix[0], x[0, :, 0] = A, b
+    copy_matrix(A, matrix[0])
+    for i in range(len(b)):
+        x[0, i, 0] = b[i]
     solve_each(matrix, x)
     return x[0, :, 0]

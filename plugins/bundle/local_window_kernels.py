@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from trihedron.pipeline.core.kernel import kernel
-from trihedron.pipeline.core.linalg_kernels import dot, invert_symmetric, matmul, matvec, tangent_columns
+from trihedron.pipeline.core.linalg_kernels import add_block, dot, invert_symmetric, matmul, matvec, split_pose, tangent_columns
 from trihedron.pipeline.core.types import F64, I32
 from trihedron.plugins.bundle.window import BundleMeasurements, BundleState
 from trihedron.plugins.mapping.landmark_kernels import EXTEND
@@ -334,7 +334,7 @@ def _add_planes(state: BundleState, seen: BundleMeasurements, loss: int, out: No
                 chi2 += r[a] * L[a, b] * r[b]
         weight, share = _loss(chi2, CHI2_95[3], min(loss, HUBER))
         cost += share
-        _add_dense(r, 3, L, Jc, 6 * k if k < seen.free else -1, 6, Jp, first + 3 * i, weight, out.H, out.g)
+        _add_dense(r, np.int64(3), L, Jc, 6 * k if k < seen.free else -1, np.int64(6), Jp, first + 3 * i, weight, out.H, out.g)
     L, Ja, Jb = np.eye(3), np.empty((2, 3)), np.empty((2, 3))
     for o in range(len(seen.relations)):
         kind, a, b = seen.relations[o]
@@ -343,7 +343,7 @@ def _add_planes(state: BundleState, seen: BundleMeasurements, loss: int, out: No
         chi2 = (r[0] * r[0] + (r[1] * r[1] if rows == 2 else 0.0)) / seen.relation_variance[o]
         weight, share = _loss(chi2, CHI2_95[2] if kind == PARALLEL else CHI2_95[1], min(loss, HUBER))
         cost += share
-        _add_dense(r, rows, L, Ja, first + 3 * a, 3, Jb, first + 3 * b, weight / seen.relation_variance[o], out.H, out.g)
+        _add_dense(r, rows, L, Ja, first + 3 * a, np.int64(3), Jb, first + 3 * b, weight / seen.relation_variance[o], out.H, out.g)
     return cost
 
 
@@ -352,35 +352,41 @@ def _add_odometry(state: BundleState, seen: BundleMeasurements, out: NormalEquat
     """Add the motions between keyframes that are neighbours in time, with squared loss: they hold a window that few landmarks connect with the
     others. Jacobians for small residuals. Returns the cost."""
     cost = 0.0
-    r, A = np.empty(6), np.zeros((6, 6))
+    r, apart, A, B = np.empty(6), np.empty(3), np.zeros((6, 6)), np.eye(6)
     for e in range(len(seen.neighbours)):
         a, b = seen.neighbours[e]
-        R_a, R_b, Z = state.rotations[a], state.rotations[b], seen.motions[e]
-        R, t = matmul(R_a.T, R_b), matvec(R_a.T, state.positions[b] - state.positions[a])
-        Z_R = np.ascontiguousarray(Z[:3, :3])
-        r[:3] = matvec(Z_R.T, t - Z[:3, 3])
-        r[3], r[4], r[5] = log_so3(matmul(Z_R.T, R))
-        A[:3, :3], A[3:, 3:] = -Z_R.T, -R.T
-        for j in range(3):  # Z_Rᵀ [t]×
-            A[j, 3] = Z_R[1, j] * t[2] - Z_R[2, j] * t[1]
+        R_a, R_b = state.rotations[a], state.rotations[b]
+        for j in range(3):
+            apart[j] = state.positions[b, j] - state.positions[a, j]
+        R, t = matmul(R_a.T, R_b), matvec(R_a.T, apart)
+        Z_R, Z_t = split_pose(seen.motions[e])
+        for j in range(3):
+            apart[j] = t[j] - Z_t[j]
+        off, turn = matvec(Z_R.T, apart), matmul(Z_R.T, R)
+        r[0], r[1], r[2] = off[0], off[1], off[2]
+        r[3], r[4], r[5] = log_so3(turn)
+        for j in range(3):
+            for k in range(3):
+                A[j, k], A[3 + j, 3 + k], B[j, k] = -Z_R[k, j], -R[k, j], turn[j, k]
+            A[j, 3] = Z_R[1, j] * t[2] - Z_R[2, j] * t[1]  # Z_Rᵀ [t]×
             A[j, 4] = Z_R[2, j] * t[0] - Z_R[0, j] * t[2]
             A[j, 5] = Z_R[0, j] * t[1] - Z_R[1, j] * t[0]
-        B = np.eye(6)
-        B[:3, :3] = matmul(Z_R.T, R)
         L = seen.motion_information[e]
         cost += dot(r, matvec(L, r))
         W_a, W_b = matmul(A.T, L), matmul(B.T, L)
         if a < seen.free:
-            out.H[6 * a : 6 * a + 6, 6 * a : 6 * a + 6] += matmul(W_a, A)
-            out.g[6 * a : 6 * a + 6] += matvec(W_a, r)
+            add_block(matmul(W_a, A), out.H, 6 * a, 6 * a)
+            for j in range(6):
+                out.g[6 * a + j] += dot(W_a[j], r)
         if b < seen.free:
-            out.H[6 * b : 6 * b + 6, 6 * b : 6 * b + 6] += matmul(W_b, B)
-            out.g[6 * b : 6 * b + 6] += matvec(W_b, r)
+            add_block(matmul(W_b, B), out.H, 6 * b, 6 * b)
+            for j in range(6):
+                out.g[6 * b + j] += dot(W_b[j], r)
         if a < seen.free and b < seen.free:
             if a < b:
-                out.H[6 * b : 6 * b + 6, 6 * a : 6 * a + 6] += matmul(W_b, A)
+                add_block(matmul(W_b, A), out.H, 6 * b, 6 * a)
             else:
-                out.H[6 * a : 6 * a + 6, 6 * b : 6 * b + 6] += matmul(W_a, B)
+                add_block(matmul(W_a, B), out.H, 6 * a, 6 * b)
     return cost
 
 

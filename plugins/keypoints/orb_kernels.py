@@ -36,7 +36,7 @@ def oriented_corners(
 def _candidates(pyramid: Pyramid, threshold: int, margin: int) -> tuple[I32, I32, I32]:
     """FAST corners of every level: pixels (n, 2), levels (n,) and strengths (n,)."""
     most = len(pyramid.pixels) // 4
-    pixels, levels, strengths, n = np.empty((most, 2), np.int32), np.empty(most, np.int32), np.empty(most, np.int32), 0
+    pixels, levels, strengths, n = np.empty((most, 2), np.int32), np.empty(most, np.int32), np.empty(most, np.int32), np.int64(0)
     for level in range(len(pyramid.shapes)):
         first, n = n, find_corners(level_of(pyramid, level), threshold, margin, pixels, strengths, n)
         levels[first:n] = level

@@ -43,14 +43,15 @@ def line_support_segments(image: U8, tolerance: float, quantisation: float, dens
     for seed in _by_strength(lines.magnitude, threshold, region.ravel()):
         if np.isnan(lines.free[2 * seed]):
             continue
-        size, x, y = _grow(region, seed, w, cosine, lines.free)
+        size, x, y = _grow(region, np.int64(seed), w, cosine, lines.free)
         if size < least:
             continue
         _fit_rectangle(region[:size], w, x, y, lines.magnitude, rectangle)
         if rectangle[5] < density:
             size = _refine(region, size, w, x, y, density, lines, rectangle)
         if size >= 2 and rectangle[5] >= density:
-            out[n] = rectangle[:4] + 0.5  # a gradient of 2 × 2 pixels lies between them
+            for k in range(4):
+                out[n, k] = rectangle[k] + 0.5  # a gradient of 2 × 2 pixels lies between them
             n += 1
     return out[:n].copy()
 
@@ -181,7 +182,7 @@ def _refine(region: I32, size: int, w: int, x: float, y: float, density: float, 
         kept = 0
         for k in range(size):
             if (region[k, 0] - sx) ** 2 + (region[k, 1] - sy) ** 2 <= reach * reach:
-                region[kept] = region[k]
+                region[kept, 0], region[kept, 1] = region[k, 0], region[k, 1]
                 kept += 1
             else:
                 _release(lines, region[k, 0], region[k, 1])

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from trihedron.pipeline.core.kernel import kernel
-from trihedron.pipeline.core.linalg_kernels import dot, matmul, matvec, solve
+from trihedron.pipeline.core.linalg_kernels import copy_matrix, dot, matmul, matvec, solve, split_pose
 from trihedron.pipeline.core.types import F64, I32
 
 
@@ -20,20 +20,32 @@ def keyframe_rotations(
     A direction v and its axis e, both in the camera: `v - Exp(-phi) e = v - e + phi × e` to first order; Cauchy's weights."""
     k = len(poses)
     H, g, rotations = np.zeros((k, 3, 3)), np.zeros((k, 3)), np.zeros((k, 3))
-    S, A, e, r = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3), np.zeros(3)
+    S, axis, regular = np.zeros((3, 3)), np.empty(3), np.empty((3, 3))
     for i in range(len(vectors)):
-        along = matvec(R_world_manhattan.T, vectors[i])
-        axis = np.argmax(np.abs(along))
-        if not abs(along[axis]) > least_cos:  # NaN too
+        along, nearest = matvec(R_world_manhattan.T, vectors[i]), 0
+        for a in range(1, 3):
+            if abs(along[a]) > abs(along[nearest]):
+                nearest = a
+        if not abs(along[nearest]) > least_cos:  # NaN too
             continue
-        R = np.ascontiguousarray(poses[keyframes[i], :3, :3])
-        e[:] = matvec(R.T, R_world_manhattan[:, axis] * np.sign(along[axis]))
-        r[:] = matvec(R.T, vectors[i]) - e
+        for a in range(3):
+            axis[a] = R_world_manhattan[a, nearest] * np.sign(along[nearest])
+        R, _ = split_pose(poses[keyframes[i]])
+        e, r = matvec(R.T, axis), matvec(R.T, vectors[i])
+        for a in range(3):
+            r[a] -= e[a]
         S[0, 1], S[0, 2], S[1, 0], S[1, 2], S[2, 0], S[2, 1] = e[2], -e[1], -e[2], e[0], e[1], -e[0]  # phi × e = S phi
-        A[:] = matmul(matmul(R.T, information[i]), R)
-        weight = 1.0 / (1.0 + dot(r, matvec(A, r)) / gate**2)
-        H[keyframes[i]] += weight * matmul(matmul(S.T, A), S)
-        g[keyframes[i]] -= weight * matvec(S.T, matvec(A, r))
+        A = matmul(matmul(R.T, information[i]), R)
+        Ar = matvec(A, r)
+        weight, SAS, SAr = 1.0 / (1.0 + dot(r, Ar) / gate**2), matmul(matmul(S.T, A), S), matvec(S.T, Ar)
+        for a in range(3):
+            g[keyframes[i], a] -= weight * SAr[a]
+            for b in range(3):
+                H[keyframes[i], a, b] += weight * SAS[a, b]
     for j in range(k):
-        rotations[j] = solve(H[j] + 1e-2 * np.eye(3), g[j])
+        copy_matrix(H[j], regular)
+        for a in range(3):
+            regular[a, a] += 1e-2
+        small = solve(regular, g[j])
+        rotations[j, 0], rotations[j, 1], rotations[j, 2] = small[0], small[1], small[2]
     return rotations, H

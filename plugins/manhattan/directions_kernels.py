@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from trihedron.pipeline.core.kernel import kernel
+from trihedron.pipeline.core.linalg_kernels import copy_matrix
 from trihedron.pipeline.core.types import F32, F64
 
 NORMALS_PER_SAMPLE = 20.0  # neighbouring normals share pixels and the sensor's errors: so many count as one
@@ -18,7 +19,7 @@ def gather_directions_kernel(normals: F32, ends_m: F32, ends_px: F32, samples: i
     surface = subsample_normals(normals, samples)
     count = len(surface)
     vectors, weights = np.empty((count + len(ends_m), 3)), np.ones(count + len(ends_m))
-    vectors[:count] = surface
+    copy_matrix(surface, vectors)
     n = count
     for i in range(len(ends_m)):
         square, pixels = 0.0, 0.0

@@ -140,13 +140,13 @@ def search_axes(directions: F64, weights: F64, starts: F64, cone: float, bandwid
     for i in range(len(chosen)):
         for k in range(3):
             alone[k, 0] = chosen[i, k]
-        frame = right_handed(shift_axes(directions, weights, alone, cone, bandwidth, 10, 1e-3)[:, 0])
+        frame = right_handed(shift_axes(directions, weights, alone, cone, bandwidth, np.int64(10), 1e-3)[:, 0])
         for turn in _quarter_turns(_histogram(directions, weights, frame, cone), turns):
             c, s = np.cos(turn), np.sin(turn)
             R = frame.copy()
             for k in range(3):
                 R[k, 1], R[k, 2] = c * frame[k, 1] + s * frame[k, 2], c * frame[k, 2] - s * frame[k, 1]
-            axes = shift_axes(directions, weights, R, cone, bandwidth, 5, 1e-3)
+            axes = shift_axes(directions, weights, R, cone, bandwidth, np.int64(5), 1e-3)
             R = orthonormal(axes, np.sqrt(mode_statistics(directions, weights, axes, cone)[:, 1]) + 1e-9)
             score = density(directions, weights, R, bandwidth)
             if score > best:

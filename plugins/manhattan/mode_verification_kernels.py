@@ -35,18 +35,25 @@ def verify_modes_kernel(
 ) -> tuple[Bool, bool]:
     """Return the modes that are seen (3,), and True if they make a Manhattan frame."""
     peaks = find_peaks_kernel(vectors, weights, first, axes, normals, lines, planes, limits)
-    on_axis = normals[:, 1] + lines[:, 1]
+    on_axis, number, explained = np.empty(len(normals)), 0, 0.0
+    for k in range(len(normals)):
+        on_axis[k] = normals[k, 1] + lines[k, 1]
     seen = largest_fitting(peaks, perpendicular(axes, normals, lines, limits.max_skew), on_axis)
-    explained = (on_axis * seen).sum() / max(weights.sum(), 1e-9)
-    return seen, seen.sum() >= 2 and explained >= limits.min_explained
+    for k in range(len(seen)):
+        if seen[k]:
+            number, explained = number + 1, explained + on_axis[k]
+    return seen, number >= 2 and explained / max(weights.sum(), 1e-9) >= limits.min_explained
 
 
 @kernel
 def find_peaks_kernel(vectors: F64, weights: F64, first: int, axes: F64, normals: F64, lines: F64, planes: F64, limits: ModeLimits) -> Bool:
     """Return True (m,) for those of the axes (3, m) that are peaks."""
     cone, least, number, share, widest, _, _ = limits
-    surfaces = surface_peaks(axes, normals, first, least, widest, planes)
-    return surfaces | line_peaks(vectors[first:], weights[first:], axes, lines, number, share, widest, cone)
+    peaks = surface_peaks(axes, normals, first, least, widest, planes)
+    by_lines = line_peaks(vectors[first:], weights[first:], axes, lines, number, share, widest, cone)
+    for k in range(len(peaks)):
+        peaks[k] = peaks[k] or by_lines[k]
+    return peaks
 
 
 @kernel
@@ -87,7 +94,7 @@ def line_peaks(directions: F64, length: F64, axes: F64, lines: F64, number: int,
     An axis is measured against the lines that no heavier axis has: a few long ones along a corridor must not outweigh what is across it."""
     peaks, left = np.zeros(len(lines), np.bool_), length.copy()
     any_peak, on_peaks, widest_peak = False, 0.0, 0.0
-    for k in descending(lines[:, 1]):
+    for k in descending(lines[:, 1].copy()):
         if lines[k, 0] < number or not lines[k, 3] < widest:
             continue
         least = by_chance(lines[k, 3], cone, 2.0 / (np.pi - 2.0 * cone), left) if any_peak else 0.0
@@ -107,7 +114,10 @@ def line_peaks(directions: F64, length: F64, axes: F64, lines: F64, number: int,
 def by_chance(mean_square: float, cone: float, per_reach: float, length: F64) -> float:
     """The length that lines (n,) without order have within reach of an axis, give or take 3 sigma; reach is 3 standard deviations of those on it."""
     share = per_reach * min(max(3.0 * np.sqrt(mean_square), np.radians(2.0)), cone)
-    return share * length.sum() + 3.0 * np.sqrt(share * (1.0 - share) * (length * length).sum())
+    total, squares = 0.0, 0.0
+    for i in range(len(length)):
+        total, squares = total + length[i], squares + length[i] * length[i]
+    return share * total + 3.0 * np.sqrt(share * (1.0 - share) * squares)
 
 
 @kernel

@@ -360,13 +360,13 @@ def farthest_samples(points: F32, count: int) -> F32:
     kept = np.empty((len(points), 3), np.float32)
     for i in range(len(points)):
         if np.isfinite(points[i, 0]):
-            kept[n] = points[i]
+            kept[n, 0], kept[n, 1], kept[n, 2] = points[i, 0], points[i, 1], points[i, 2]
             n += 1
     distance = np.full(n, np.inf)
     chosen = 0
     for k in range(min(n, count)):
-        out[k] = kept[chosen]
         x, y, z = kept[chosen, 0], kept[chosen, 1], kept[chosen, 2]
+        out[k, 0], out[k, 1], out[k, 2] = x, y, z
         farthest = -1.0
         for i in range(n):
             distance[i] = min(distance[i], (kept[i, 0] - x) ** 2 + (kept[i, 1] - y) ** 2 + (kept[i, 2] - z) ** 2)

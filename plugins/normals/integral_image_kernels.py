@@ -34,7 +34,7 @@ def patch_normals(
     flat, flat_halves = sums.reshape(-1).view(np.float64), halves.reshape(-1).view(np.float64)
     sums[0].view(np.float64)[:] = 0.0
     flat_halves[:] = 0.0
-    done = 0
+    done = np.int64(0)  # as a literal, numba would compile `_block_row` for it, too
     for r in range(h):
         while done < min(r + most + 1, h):
             _read_strip(depth, done * stride, strip)
@@ -48,7 +48,7 @@ def patch_normals(
         for c in range(w):
             size[c] = min(radii[min(size[c], last)], rings[r, c]) if size[c] >= 0 else 0
         needed[:] = np.inf
-        c = 0
+        c = np.int64(0)
         while c < w:
             k, first = size[c], c
             c += 1

@@ -34,7 +34,7 @@ def angle_across(q: F64, columns: F64, member: Bool) -> float:
             dzx, dzy, dzz = dzx + nz * x, dzy + nz * y, dzz + nz * z
     C = np.array([[cxx, cxy, cxz], [cxy, cyy, cyz], [cxz, cyz, czz]])
     D = np.array([[dxx, dxy, dxz], [dyx, dyy, dyz], [dzx, dzy, dzz]])
-    return linear_spread(C, D, np.array([sx, sy, sz]), np.array([tx, ty, tz]), m, -q) if m >= 3 else 0.0
+    return linear_spread(C, D, np.array([sx, sy, sz]), np.array([tx, ty, tz]), float(m), q) if m >= 3 else 0.0
 
 
 @kernel
@@ -98,7 +98,9 @@ def normal_statistics(labels: I32, planes: F64, grid: Grid, cos_cone: float, ste
     unit, C, D = np.empty((regions, 3)), np.zeros((regions, 3, 3)), np.zeros((regions, 3, 3))
     sum_x, sum_n, x = np.zeros((regions, 3)), np.zeros((regions, 3)), np.empty(3)
     for k in range(regions):
-        unit[k] = -planes[k] / max(np.sqrt(dot(planes[k], planes[k])), 1e-12)
+        length = max(np.sqrt(dot(planes[k], planes[k])), 1e-12)
+        for a in range(3):
+            unit[k, a] = -planes[k, a] / length
     for r in range(0, h, step):
         for c in range(0, w, step):
             k = labels[r, c] - 1

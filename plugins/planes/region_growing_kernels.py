@@ -27,7 +27,9 @@ def grow_regions(labels: U8, planes: F64, grid: Grid, gate: float, reach: int, c
     nearby = np.empty(h * w, np.int32)
     unit = np.empty_like(planes)
     for k in range(len(planes)):
-        unit[k] = -planes[k] / max(np.sqrt(dot(planes[k], planes[k])), 1e-12)
+        length = max(np.sqrt(dot(planes[k], planes[k])), 1e-12)
+        for a in range(3):
+            unit[k, a] = -planes[k, a] / length
     ring = 0
     while len(frontier) > 0:
         m = 0

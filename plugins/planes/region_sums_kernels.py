@@ -21,7 +21,8 @@ def accumulate(labels: U8, regions: int, grid: Grid) -> tuple[F64, F64, F64, I32
     sums, n = np.zeros((regions + 1, 19)), np.zeros(regions + 1, np.int32)  # upper triangles of A and M, row by row, and b between them
     h, w = labels.shape
     row = np.empty((5, w))  # x/z, inverse depth, depth and weights
-    row[0] = rays_x
+    for c in range(w):
+        row[0, c] = rays_x[c]
     for r in range(h):
         weigh_cells(sigma[r], count[r], row[3])
         for c in range(w):

@@ -83,7 +83,7 @@ def keyframes_seen(pose: Pose, map: Map, rows: I32, poses: F64) -> Keyframes:
     """Return the keyframes in rows (k,) of the map, with poses (k, 4, 4), their velocities, and their errors by the calibration for the camera."""
     sensitivities, twists = map.keyframes.columns_at(rows, "sensitivity", "twist")
     twists[rows == pose.reference] = pose.reference_twist
-    return keyframes_at(constant(pose.T_world_camera, np.float64), poses, twists, sensitivities)
+    return keyframes_at(constant(pose.T_world_camera, np.float64), poses, constant(twists, np.float64), sensitivities)
 
 
 def carried_sensitivity(pose: Pose, previous: Pose) -> F64:

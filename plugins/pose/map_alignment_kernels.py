@@ -38,5 +38,6 @@ def observed_surfaces(labels: U8, stride: int, coefficients: F64, pixels: F64) -
         x, y = round(pixels[i, 0] / stride), round(pixels[i, 1] / stride)
         label = labels[min(max(y, 0), labels.shape[0] - 1), min(max(x, 0), labels.shape[1] - 1)]
         if label:
-            out[i] = coefficients[label - 1]
+            for k in range(4):
+                out[i, k] = coefficients[label - 1, k]
     return out

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from trihedron.pipeline.core.kernel import kernel
-from trihedron.pipeline.core.linalg_kernels import dot, inverse_positive, matmul
+from trihedron.pipeline.core.linalg_kernels import dot, inverse_positive, matmul, split_pose, sum_matrices
 from trihedron.pipeline.core.types import F64
 from trihedron.plugins.shared.lie_kernels import adjoint_between
 from trihedron.plugins.shared.pose_optimizer_kernels import Flags, Groups, add_scores
@@ -21,14 +21,15 @@ def scatter_and_drift(
 ) -> tuple[float, F64, bool]:
     """Return `residual_scale` and `covariance_of_keyframes` at a pose T (4, 4), by the terms that are not outliers, each of the keyframe that created
     its landmark, with poses (k, 4, 4) and covariances (k, 6, 6); and whether there are any such terms."""
-    information, scores = np.zeros((len(poses), 6, 6)), np.zeros((len(poses), 6))
-    R, t = np.ascontiguousarray(T[:3, :3]), np.ascontiguousarray(T[:3, 3])
+    information, scores, some = np.zeros((len(poses), 6, 6)), np.zeros((len(poses), 6)), False
+    R, t = split_pose(T)
     add_scores(R, t, camera, points, lines, planes, flags, created, information, scores)
     for k in range(len(poses)):
         for a in range(6):
-            for b in range(a):
+            for b in range(a + 1):
+                some = some or information[k, a, b] != 0.0
                 information[k, b, a] = information[k, a, b]
-    return residual_scale(information, scores), covariance_of_keyframes(T, poses, covariances, information), bool(np.any(information != 0.0))
+    return residual_scale(information, scores), covariance_of_keyframes(T, poses, covariances, information), some
 
 
 @kernel
@@ -39,8 +40,11 @@ def residual_scale(information: F64, scores: F64) -> float:
     With independent errors of the stated covariance the score of group k, less its share of the pose's adjustment, has covariance
     `H_k - H_k H⁻¹ H_k`. The cluster-robust ("sandwich") estimate of the pose's covariance (Liang and Zeger, Biometrika 1986) exceeds `H⁻¹` by this
     factor, averaged over directions."""
-    inverse, total = inverse_positive(information.sum(axis=0)), scores.sum(axis=0)
+    inverse, total = inverse_positive(sum_matrices(information)), np.zeros(6)
     freedom, squared, rest = 6.0, 0.0, np.empty(6)
+    for k in range(len(scores)):
+        for a in range(6):
+            total[a] += scores[k, a]
     for k in range(len(information)):
         share = matmul(information[k], inverse)
         for a in range(6):
@@ -60,13 +64,18 @@ def covariance_of_keyframes(T: F64, poses: F64, covariances: F64, information: F
     information (k, 6, 6) of its landmarks, as that of xi of the camera at T (4, 4).
 
     The errors of keyframes are a random walk, in which the covariance of two is the variance of the earlier."""
-    inverse = inverse_positive(information.sum(axis=0) + np.eye(6))
-    weights = np.empty(len(poses))
+    total = sum_matrices(information)
+    for a in range(6):
+        total[a, a] += 1.0
+    inverse, weights, sum_of_weights = inverse_positive(total), np.zeros(len(poses)), 0.0
     for k in range(len(poses)):
-        weights[k] = (information[k] * inverse).sum()
-    weights /= weights.sum()
+        for a in range(6):
+            for b in range(6):
+                weights[k] += information[k, a, b] * inverse[a, b]
+        sum_of_weights += weights[k]
     common, to_camera, later = np.zeros((6, 6)), np.empty((6, 6)), 0.0
     for k in range(len(poses) - 1, -1, -1):
+        weights[k] /= sum_of_weights
         if weights[k] > 0.0:
             adjoint_between(T, poses[k], to_camera)
             half, share = matmul(to_camera, covariances[k]), weights[k] * (weights[k] + 2.0 * later)

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from trihedron.pipeline.core.kernel import kernel
-from trihedron.pipeline.core.linalg_kernels import inverse_positive, matmul, matvec, tangent_columns
+from trihedron.pipeline.core.linalg_kernels import add_matrix, copy_matrix, inverse_positive, matmul, matvec, split_pose, tangent_columns
 from trihedron.pipeline.core.types import CALIBRATION, F32, F64, I32, U8
 from trihedron.plugins.shared.lie_kernels import adjoint_between
 from trihedron.plugins.shared.pose_optimizer_kernels import Flags
@@ -184,7 +184,7 @@ def _point_calibration_jacobian(
                 Q[a, b] = R[0, a] * keyframes.R[k, 0, b] + R[1, a] * keyframes.R[k, 1, b] + R[2, a] * keyframes.R[k, 2, b]
         _plane_then(surface, Q, p, q, then)
         _add_point_error(q, then, Q, keyframes.twists[k], camera, width, height, D, E, K)
-        A += keyframes.errors[k]
+        add_matrix(keyframes.errors[k], A)
         seen += 1
     if seen == 0:
         return False
@@ -266,8 +266,9 @@ def _plane_calibration_jacobian(
             if not in_view(q, camera, width, height):
                 continue
             plane_point_error(q, then[o], keyframes.twists[k], camera, width, height, E)
-            mean += E
-            A += keyframes.errors[k]
+            for c in range(CALIBRATION):
+                mean[c] += E[c]
+            add_matrix(keyframes.errors[k], A)
             count += 1
         if count == 0:
             continue
@@ -281,7 +282,7 @@ def _plane_calibration_jacobian(
                 X[a, c] += row[a] * (F[c] - mean[c] / count)
     if seen < LEAST_SAMPLES:
         return False
-    K[:] = matmul(inverse_positive(N), X)
+    copy_matrix(matmul(inverse_positive(N), X), K)
     A /= total
     return True
 
@@ -299,7 +300,7 @@ def _add_planes(
             continue
         plane = planes.coefficients[i]
         tangent_columns(planes.observed[i], B)
-        plane_residual(SAME, R, t, plane, planes.observed[i], B, r, J)
+        plane_residual(np.int32(SAME), R, t, plane, planes.observed[i], B, r, J)
         if _plane_calibration_jacobian(R, t, plane, samples[i], observers[i], keyframes, twist, camera, width, height, B, K, A):
             _scale_and_subtract(scales, J, A, K)
             _add(J, W[i], K, r, WJ, WK, total)
@@ -311,7 +312,7 @@ def calibration_equations(
     samples: F32, observers: Observers, keyframes: Keyframes,
 ) -> Equations:  # fmt: skip
     """Normal equations of the inliers among points and identical planes at the pose T (4, 4), for parameters in units of `scales` (12,)."""
-    R, t = np.ascontiguousarray(T[:3, :3]), np.ascontiguousarray(T[:3, 3])
+    R, t = split_pose(T)
     total = Equations(
         np.zeros((6, 6)), np.zeros(6), np.zeros((6, CALIBRATION)), np.zeros((CALIBRATION, CALIBRATION)), np.zeros(CALIBRATION)
     )  # fmt: skip
@@ -337,10 +338,14 @@ def moved_sensitivity(T: F64, previous: F64, sensitivity: F64) -> F64:
 @kernel
 def keyframes_at(T: F64, poses: F64, twists: F64, sensitivities: F64) -> Keyframes:
     """Return keyframes with poses (m, 4, 4), velocities (m, 6) and errors by the calibration (m, 6, 12) of their own, for a camera at T (4, 4)."""
-    errors = np.empty(sensitivities.shape)
+    R, t, errors = np.empty((len(poses), 3, 3)), np.empty((len(poses), 3)), np.empty(sensitivities.shape)
     for k in range(len(poses)):
-        errors[k] = moved_sensitivity(T, poses[k], sensitivities[k])
-    return Keyframes(np.ascontiguousarray(poses[:, :3, :3]), np.ascontiguousarray(poses[:, :3, 3]), twists, errors)
+        for i in range(3):
+            t[k, i] = poses[k, i, 3]
+            for j in range(3):
+                R[k, i, j] = poses[k, i, j]
+        copy_matrix(moved_sensitivity(T, poses[k], sensitivities[k]), errors[k])
+    return Keyframes(R, t, twists, errors)
 
 
 @kernel
@@ -368,7 +373,15 @@ def calibration_moment(information: F64, score: F64) -> F64:
     finds that the residuals ask for it."""
     v = 1.0
     for _ in range(EXPECTATIONS + 1):
-        covariance = inverse_positive(information + np.eye(CALIBRATION) / v)
+        covariance, trace, square = information.copy(), 0.0, 0.0
+        for k in range(CALIBRATION):
+            covariance[k, k] += 1.0 / v
+        covariance = inverse_positive(covariance)
         mean = matvec(covariance, score)
-        v = max(1.0, (PRIOR_COUNT + np.trace(covariance) + (mean * mean).sum()) / (PRIOR_COUNT + CALIBRATION))
-    return covariance + np.outer(mean, mean)
+        for k in range(CALIBRATION):
+            trace, square = trace + covariance[k, k], square + mean[k] * mean[k]
+        v = max(1.0, (PRIOR_COUNT + trace + square) / (PRIOR_COUNT + CALIBRATION))
+    for i in range(CALIBRATION):
+        for j in range(CALIBRATION):
+            covariance[i, j] += mean[i] * mean[j]
+    return covariance

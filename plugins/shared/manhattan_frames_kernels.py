@@ -323,7 +323,8 @@ def perpendicular_pair(walls: Walls, max_cos: float, largest_cos: float, reach: 
             sigma = np.sqrt(walls.variance[i] + walls.variance[j])
             if abs(a[0] * b[0] + a[1] * b[1] + a[2] * b[2]) <= min(max_cos + 2.0 * sigma, largest_cos):
                 swap = walls.variance[j] < walls.variance[i]  # the first axis is the better known
-                first[count], second[count] = (b, a) if swap else (a, b)
+                for k in range(3):
+                    first[count, k], second[count, k] = (b[k], a[k]) if swap else (a[k], b[k])
                 count += 1
     if count == 0:
         return False, before.copy()

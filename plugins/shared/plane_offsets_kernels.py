@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from trihedron.pipeline.core.kernel import kernel
+from trihedron.pipeline.core.linalg_kernels import split_pose
 from trihedron.pipeline.core.types import CALIBRATION, F32, F64, I32
 from trihedron.plugins.shared.calibration_error_kernels import Keyframes, in_view, plane_point_error, to_keyframe, to_observers
 from trihedron.plugins.shared.residuals_kernels import to_camera
@@ -29,7 +30,7 @@ def distance_sigmas(
     map that they were matched with; NaN for those that none of the plane's `observers` (m, o) had in its image.
 
     A sample errs by the calibration, less the mean error of what its observers saw of the plane there, and by the error of the pose, less theirs."""
-    R, t = np.ascontiguousarray(T[:3, :3]), np.ascontiguousarray(T[:3, 3])
+    R, t = split_pose(T)
     out = np.full(samples.shape[:2], np.nan)
     now, then, p, q, world, J = np.empty(4), np.empty((observers.shape[1], 4)), np.empty(3), np.empty(3), np.empty(3), np.empty(6)
     E, error = np.empty(CALIBRATION), np.empty(CALIBRATION)

@@ -29,8 +29,10 @@ def rotation_of_normals(before: F64, now: F64, variance: F64, importance: F64, R
             difference[i, k] = (now[i, k] if along > 0.0 else -now[i, k]) - predicted[i, k]
     r, H, g = np.zeros(3), np.empty((3, 3)), np.empty(3)
     for _ in range(ROUNDS):
-        H[:] = np.eye(3) / (prior * prior)
-        g[:] = 0.0
+        for a in range(3):
+            g[a] = 0.0
+            for b in range(3):
+                H[a, b] = 1.0 / (prior * prior) if a == b else 0.0
         for i in range(n):
             w, p, d = weights[i] * importance[i] / variance[i], predicted[i], difference[i]
             squared = p[0] * p[0] + p[1] * p[1] + p[2] * p[2]

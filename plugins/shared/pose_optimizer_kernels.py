@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from trihedron.pipeline.core.kernel import kernel
-from trihedron.pipeline.core.linalg_kernels import add_triangle, add_triple, inverse_positive, solve_positive, tangent_columns
+from trihedron.pipeline.core.linalg_kernels import add_triangle, add_triple, copy_matrix, inverse_positive, solve_positive, tangent_columns
 from trihedron.pipeline.core.types import F64, I32, U8
 from trihedron.plugins.shared.lie_kernels import exp_so3, log_so3
 from trihedron.plugins.shared.residuals_kernels import (
@@ -477,11 +477,15 @@ def solve(
     share = gate_efficiency(_residual_count(points, planes, flags), free) if rounds else 1.0
     covariance, information, complete = _marginal_covariance(data, share, prior, free)
     T = np.eye(4)
-    T[:3, :3], T[:3, 3] = R, t
+    copy_matrix(R, T)
+    for i in range(3):
+        T[i, 3] = t[i]
     return T, covariance, information, dx, cost, complete
 
 
 @kernel
 def _copy(A: F64, a: F64, B: F64, b: F64) -> None:
     """Copy a matrix (n, n) and a vector (n,), a pose or normal equations, into B and b."""
-    B[:], b[:] = A, a
+    copy_matrix(A, B)
+    for i in range(len(a)):
+        b[i] = a[i]

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from trihedron.pipeline.core.kernel import kernel
-from trihedron.pipeline.core.linalg_kernels import polar_rotation
+from trihedron.pipeline.core.linalg_kernels import copy_matrix, polar_rotation
 from trihedron.pipeline.core.types import F64, I32
 
 LEAST_M = 0.05  # between the three points of a sample
@@ -15,14 +15,15 @@ LEAST_M = 0.05  # between the three points of a sample
 @kernel
 def _frame(a: F64, b: F64, c: F64, out: F64) -> bool:
     """Fill the axes (columns) spanned by three points; False when these are too near to each other or to a line."""
-    u, v = b - a, c - a
-    n = np.array([u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]])
-    length, size = np.sqrt((u * u).sum()), np.sqrt((n * n).sum())
+    ux, uy, uz, vx, vy, vz = b[0] - a[0], b[1] - a[1], b[2] - a[2], c[0] - a[0], c[1] - a[1], c[2] - a[2]
+    nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+    length, size = np.sqrt(ux * ux + uy * uy + uz * uz), np.sqrt(nx * nx + ny * ny + nz * nz)
     if length < LEAST_M or size < LEAST_M * length:
         return False
-    u, n = u / length, n / size
-    out[:, 0], out[:, 1] = u, n
-    out[0, 2], out[1, 2], out[2, 2] = u[1] * n[2] - u[2] * n[1], u[2] * n[0] - u[0] * n[2], u[0] * n[1] - u[1] * n[0]
+    ux, uy, uz, nx, ny, nz = ux / length, uy / length, uz / length, nx / size, ny / size, nz / size
+    out[0, 0], out[1, 0], out[2, 0] = ux, uy, uz
+    out[0, 1], out[1, 1], out[2, 1] = nx, ny, nz
+    out[0, 2], out[1, 2], out[2, 2] = uy * nz - uz * ny, uz * nx - ux * nz, ux * ny - uy * nx
     return True
 
 
@@ -98,5 +99,6 @@ def rigid_hypotheses_kernel(camera_m: F64, world_m: F64, limit: F64, samples: I3
             t[r] = q[r] - (R[r, 0] * p[0] + R[r, 1] * p[1] + R[r, 2] * p[2])
         for i in range(len(camera_m)):
             inliers[k] += _squared_error(R, t, camera_m, world_m, i) <= limit[i] * limit[i]
-        poses[k, :3, :3], poses[k, :3, 3], poses[k, 3, 3] = R, t, 1.0
+        copy_matrix(R, poses[k])
+        poses[k, 0, 3], poses[k, 1, 3], poses[k, 2, 3], poses[k, 3, 3] = t[0], t[1], t[2], 1.0
     return poses, inliers

@@ -64,7 +64,7 @@ def insert_blocks(keys: I64, numbers: I32, fresh: I32, places: I32, count: int) 
         key = key_of(fresh[i, 0], fresh[i, 1], fresh[i, 2])
         slot = slot_of(keys, key)
         keys[slot], numbers[slot] = key, count
-        places[count] = fresh[i]
+        places[count, 0], places[count, 1], places[count, 2] = fresh[i, 0], fresh[i, 1], fresh[i, 2]
         count += 1
     return count
 

@@ -86,7 +86,7 @@ def grow_kernel(
             tried[queue[i]] = True
         if total >= least:
             n, d = plane_through(middle, area, queue[:size], n)
-            found[count, :3], found[count, 3] = n, d
+            found[count, 0], found[count, 1], found[count, 2], found[count, 3] = n[0], n[1], n[2], d
             for i in range(size):
                 if abs(dot(middle[queue[i]], n) + d) <= distance:
                     labels[queue[i]] = first + count
@@ -97,20 +97,25 @@ def grow_kernel(
 @kernel
 def plane_through(middle: F64, area: F64, rows: I32, like: F64) -> tuple[F64, float]:
     """Least squares plane through the middles of triangles, weighed by area, facing as `like` does."""
-    centre, total = np.zeros(3), 0.0
+    centre, total, scatter, p, n = np.zeros(3), 0.0, np.zeros((3, 3)), np.empty(3), np.empty(3)
     for t in rows:
-        centre += area[t] * middle[t]
+        for i in range(3):
+            centre[i] += area[t] * middle[t, i]
         total += area[t]
-    centre /= total
-    scatter = np.zeros((3, 3))
+    for i in range(3):
+        centre[i] /= total
     for t in rows:
-        p = middle[t] - centre
+        for i in range(3):
+            p[i] = middle[t, i] - centre[i]
         for i in range(3):
             for j in range(3):
                 scatter[i, j] += area[t] * p[i] * p[j]
-    n = np.ascontiguousarray(eigh(scatter)[1][:, 0])
+    vectors = eigh(scatter)[1]
+    for i in range(3):
+        n[i] = vectors[i, 0]
     if dot(n, like) < 0.0:
-        n = -n
+        for i in range(3):
+            n[i] = -n[i]
     return n, -dot(n, centre)
 
 
@@ -200,9 +205,12 @@ def curvature_kernel(parts: I32, count: int, labels: I32, middle: F64, area: F64
     for c in range(count):
         if total[c] > 0.0:
             for i in range(6):
-                normal[c, :i, i] = normal[c, i, :i]
+                for j in range(i):
+                    normal[c, j, i] = normal[c, i, j]
             for i in range(3, 6):
                 normal[c, i, i] += 1e-9 * total[c]  # a strip does not determine its curvature across
-            q = solve(normal[c] + 1e-12 * np.eye(6), right[c])
+            for i in range(6):
+                normal[c, i, i] += 1e-12
+            q = solve(normal[c], right[c])
             bend[c] = abs(0.5 * (q[3] + q[5])) + np.sqrt(0.25 * (q[3] - q[5]) ** 2 + q[4] ** 2)
     return bend

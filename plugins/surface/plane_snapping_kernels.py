@@ -31,7 +31,8 @@ def planes_about(count: int, triangles: I32, labels: I32) -> tuple[I32, I32]:
                     at -= 1
                 if at > ends[v] and rows[at - 1] == labels[t]:
                     continue
-                rows[at + 1 : filled[v] + 1] = rows[at : filled[v]].copy()
+                for i in range(filled[v], at, -1):
+                    rows[i] = rows[i - 1]
                 rows[at] = labels[t]
                 filled[v] += 1
     starts, size = np.zeros(count + 1, np.int32), 0
@@ -58,7 +59,8 @@ def snap_kernel(vertices: F64, rows: I32, starts: I32, planes: F64, farthest: fl
                 if abs(_height(vertices[v], planes[rows[k]])) < abs(_height(vertices[v], planes[rows[nearest]])):
                     nearest = k
             step, _ = _step(vertices[v], planes, rows[nearest : nearest + 1])
-        out[v] += step
+        for i in range(3):
+            out[v, i] += step[i]
     return out
 
 
@@ -80,12 +82,14 @@ def unfold(points: F64, triangles: I32, normals: F64, rows: I32, starts: I32) ->
             if folded[v]:
                 for other in (triangles[t, (k + 1) % 3], triangles[t, (k + 2) % 3]):
                     if _includes(rows[starts[other] : starts[other + 1]], rows[starts[v] : starts[v + 1]]):
-                        total[v, :3] += points[other]
+                        for i in range(3):
+                            total[v, i] += points[other, i]
                         total[v, 3] += 1.0
     count = 0
     for v in range(len(points)):
         if total[v, 3] > 0.0:
-            points[v] = total[v, :3] / total[v, 3]
+            for i in range(3):
+                points[v, i] = total[v, i] / total[v, 3]
             count += 1
     return count
 
@@ -124,5 +128,7 @@ def _step(p: F64, planes: F64, rows: I32) -> tuple[F64, float]:
     step = np.zeros(3)
     for i in range(3):
         if values[i] > LEAST * values[2]:
-            step -= vectors[:, i] * (dot(vectors[:, i], r) / values[i])
+            length = dot(vectors[:, i], r) / values[i]
+            for j in range(3):
+                step[j] -= vectors[j, i] * length
     return step, np.sqrt(dot(step, step))

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trihedron.pipeline.core.kernel import kernel
+from trihedron.pipeline.core.linalg_kernels import copy_matrix
 from trihedron.pipeline.core.types import F32, F64, I32
 from trihedron.plugins.shared.tsdf_volume import CELLS
 from trihedron.plugins.shared.tsdf_volume_kernels import SIDE
@@ -109,7 +110,7 @@ def vertices_kernel(places: I32, distance: F32, signs: I8, around: I32, cells: I
                         crossings += 1
             if count == len(out):
                 larger = np.empty((2 * count, 3))
-                larger[:count] = out
+                copy_matrix(out, larger)
                 out = larger
             out[count, 0] = (places[b, 0] * SIDE + x + sx / crossings) * voxel
             out[count, 1] = (places[b, 1] * SIDE + y + sy / crossings) * voxel
@@ -149,7 +150,7 @@ def triangles_kernel(signs: I8, around: I32, cells: I32, vertices: F64) -> I32:
                     continue
                 if count + 2 > len(out):
                     larger = np.empty((2 * len(out), 3), np.int32)
-                    larger[:count] = out[:count]
+                    copy_matrix(out[:count], larger)
                     out = larger
                 if here > 0:  # before the surface at the lower end: outside is towards -axis
                     q[1], q[3] = q[3], q[1]
