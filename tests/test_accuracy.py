@@ -41,6 +41,17 @@ def test_every_frame_is_tracked_within_the_limit(tmp_path, name):
     assert metrics["causal"]["ate_rmse_m"] < limit_m
 
 
+@pytest.mark.parametrize(
+    ("scene", "length"), [("corridor", 15), pytest.param("corridor", 0, marks=pytest.mark.slow), pytest.param("offices", 0, marks=pytest.mark.slow)]
+)
+def test_exact_depth_does_not_contradict_itself(tmp_path, scene, length):
+    """Walls at a grazing angle: a key point that is off by half a pixel has the depth of a place centimetres away."""
+    words = ["dataset.noise=false", "dataset.fps=10", "dataset.width=320", "dataset.height=240", *([f"dataset.length={length}"] if length else [])]
+    metrics = track(tmp_path / "run", f"dataset.scene={scene}", *words)
+    assert metrics["status"]["degraded"] == metrics["status"]["lost"] == 0
+    assert metrics["causal"]["ate_rmse_m"] < 0.006
+
+
 REMOVED = {  # what is removed -> where it is missed most, how, and the least factor by which the error must grow
     "points": ([], ["keypoints=none"], 1.2),
     "lines": (["dataset.texture=false"], ["lines=none"], 1.05),

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trihedron.pipeline.core.options import NonNegativeFloat, PositiveFloat, PositiveShare, Range
-from trihedron.pipeline.core.types import F32, F64, U8, Frame, Keypoints
+from trihedron.pipeline.core.types import EXACT_DEPTH, F32, F64, U8, Frame, Keypoints
 from trihedron.plugins.shared.depth_image_kernels import local_depth
 from trihedron.plugins.shared.edge_width import motion_blur_px
 
@@ -38,15 +38,21 @@ def lift_keypoints(
     options: LiftOptions, frame: Frame, pixels: F32, scales: F64, octaves: U8, angles_deg: F32, descriptors: U8, metric: str = "hamming"
 ) -> Keypoints:  # fmt: skip
     """Lift key points at pixels (n, 2) with scales (n,), 1 for the finest, octaves (n,), directions (n,) and descriptors (n, b); points are NaN
-    without reliable depth. The noise of pixels grows with the scale and includes the blur of the image."""
+    without reliable depth. The noise of pixels grows with the scale and includes the blur of the image.
+
+    Rendered depth is exact at every pixel, but a key point is off by a part of one, and so is its depth, on a surface that is seen at a slant: at 45°
+    as far as the point is off across the ray."""
     points_m, sigma_m = lift_pixels(options, frame, pixels)
     blur_px = motion_blur_px(frame.gray)
+    sigma_px = np.hypot(options.sigma_px * scales, blur_px)
+    if frame.camera.depth_noise == EXACT_DEPTH:
+        sigma_m = np.hypot(sigma_m, points_m[:, 2] * sigma_px / frame.camera.fx).astype(np.float32)
     return Keypoints(
         index=frame.index,
         stamp_ns=frame.stamp_ns,
         pixels=pixels,
         points_m=points_m,
-        sigma_px=np.hypot(options.sigma_px * scales, blur_px).astype(np.float32),
+        sigma_px=sigma_px.astype(np.float32),
         sigma_m=sigma_m,
         octaves=octaves,
         angles_deg=angles_deg,

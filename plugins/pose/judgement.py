@@ -92,7 +92,10 @@ def reason_to_be_lost(options: JudgementOptions, evidence: Evidence, start_statu
     """Return why a frame is lost although the previous one, or relocalisation, gave it a pose (`start_status`); empty where it is not."""
     inliers, tracked = evidence.inliers, is_tracked(options, evidence.inliers)
     agree = f"only {inliers.total} of {inliers.matches} matches"
-    if start_status != LOST and not tracked and (doubt := _repeating(evidence.previous.repeats) or contradicting_depth(evidence.previous)):
+    doubt = "" if tracked else _repeating(evidence.previous.repeats)
+    if not is_tracked(options, inliers, planes=False):  # they are of the depth that is in doubt
+        doubt = doubt or contradicting_depth(evidence.previous)
+    if start_status != LOST and doubt:
         return f"{doubt}; and now {agree} with the map agree"
     if evidence.rotation.source == "prediction" and not tracked:
         return f"the rotation was not measured, and {agree} with the map agree"
@@ -253,9 +256,11 @@ def _by_information(options: JudgementOptions, evidence: Evidence) -> TrackingSt
     return TrackingStatus(status, reason)
 
 
-def is_tracked(options: JudgementOptions, inliers: InlierStatistics) -> bool:
-    """Return True if enough of the map agrees with a tracked pose."""
-    return inliers.score >= options.min_inliers and inliers.total >= options.min_share * inliers.matches
+def is_tracked(options: JudgementOptions, inliers: InlierStatistics, planes: bool = True) -> bool:
+    """Return True if enough of the map agrees with a tracked pose; without `planes`, enough points and lines of it."""
+    points, lines, _ = inliers.inliers
+    score = inliers.score if planes else points + 2 * lines
+    return score >= options.min_inliers and inliers.total >= options.min_share * inliers.matches
 
 
 def _is_another_place(options: JudgementOptions, problem: MapAlignment, continued: int) -> bool:

@@ -261,6 +261,19 @@ def test_what_contradicts_is_not_continued_without_the_map(world, map):
     assert continued.status == "degraded"
 
 
+def test_planes_that_contradict_the_map_do_not_tie_a_frame_to_it(world, map):
+    """A frame that matches three planes, one point and one line, after one whose planes contradicted the map and after one whose did not."""
+    start, features, matches = matched(world, map)
+    few = dataclasses.replace(matches, keypoints=matches.keypoints[:1], segments=matches.segments[:1])
+    before = pose_of(camera_at(STEP - 1), STEP - 1)
+    lost, continued = (
+        Refine()(world.frame(STEP).camera, *start, None, few, *features, dataclasses.replace(before, plane_offsets=offsets), map, None)
+        for offsets in (np.array([0.02, 0.005, 60.0]), np.array([0.006, 0.005, 60.0]))
+    )
+    assert lost.status == "lost" and lost.reason.endswith("usually 0.5 %; and now only 5 of 5 matches with the map agree")
+    assert continued.status != "lost"
+
+
 def test_a_jump_needs_the_map(world, map):
     """A frame to which the camera moved back at 30 m/s after it had gone on: with all matches, and with one of each kind, by which the map would go
     on from anywhere."""
