@@ -231,7 +231,7 @@ def _depth_noise(path: Path, given: Any) -> DepthNoise:
     known = tuple(field.name for field in fields(DepthNoise))
     _check_keys(path, "depth_noise", given, known, "give it some of")
     numbers = {key: _number(path, f"depth_noise.{key}", value) for key, value in given.items()}
-    noise = DepthNoise(**{"a_m": 0.0, "b": 0.0, "c_per_m": 0.0, **numbers})
+    noise = replace(EXACT_DEPTH, **numbers)
     faulty = next((key for key, value in numbers.items() if abs(value) > LARGEST_NOISE), "floor_m" if noise.floor_m <= 0.0 else "")
     if faulty:
         cure = f"give floor_m above 0 and the others within ±{LARGEST_NOISE:g}: σ is max(floor_m, a_m + b z + c_per_m z²) at z metres"

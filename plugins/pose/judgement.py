@@ -93,7 +93,7 @@ def reason_to_be_lost(options: JudgementOptions, evidence: Evidence, start_statu
     inliers, tracked = evidence.inliers, is_tracked(options, evidence.inliers)
     agree = f"only {inliers.total} of {inliers.matches} matches"
     doubt = "" if tracked else _repeating(evidence.previous.repeats)
-    if not is_tracked(options, inliers, planes=False):  # they are of the depth that is in doubt
+    if not (tracked and inliers.image_score >= options.min_inliers):  # planes are of the depth that is in doubt
         doubt = doubt or contradicting_depth(evidence.previous)
     if start_status != LOST and doubt:
         return f"{doubt}; and now {agree} with the map agree"
@@ -249,18 +249,16 @@ def _by_information(options: JudgementOptions, evidence: Evidence) -> TrackingSt
         status, reason = DEGRADED, f"only {points} points, {lines} lines and {planes} planes of the map were found"
     elif inliers.total < options.min_share * inliers.matches:
         status, reason = DEGRADED, f"only {inliers.total} of {inliers.matches} matches with the map agree"
-    elif solution.disputed and points + 2 * lines < options.min_inliers:
+    elif solution.disputed and inliers.image_score < options.min_inliers:
         status, reason = DEGRADED, f"planes alone observe {solution.disputed} directions of motion, and disagree with the map"
     elif evidence.rotation.source == "prediction":
         status, reason = DEGRADED, "the rotation was predicted, not measured, before refinement"
     return TrackingStatus(status, reason)
 
 
-def is_tracked(options: JudgementOptions, inliers: InlierStatistics, planes: bool = True) -> bool:
-    """Return True if enough of the map agrees with a tracked pose; without `planes`, enough points and lines of it."""
-    points, lines, _ = inliers.inliers
-    score = inliers.score if planes else points + 2 * lines
-    return score >= options.min_inliers and inliers.total >= options.min_share * inliers.matches
+def is_tracked(options: JudgementOptions, inliers: InlierStatistics) -> bool:
+    """Return True if enough of the map agrees with a tracked pose."""
+    return inliers.score >= options.min_inliers and inliers.total >= options.min_share * inliers.matches
 
 
 def _is_another_place(options: JudgementOptions, problem: MapAlignment, continued: int) -> bool:

@@ -57,6 +57,11 @@ class InlierStatistics:
         return sum(count * score for count, score in zip(self.inliers, LANDMARK_SCORE))
 
     @property
+    def image_score(self) -> int:
+        """`score` without planes, which depth alone measures: points + 2 lines."""
+        return sum(count * score for count, score in zip(self.inliers[:2], LANDMARK_SCORE))
+
+    @property
     def most_planes_disagree(self) -> bool:
         """True if less than half of the planes are inliers."""
         return 2 * self.inliers[2] < self.matched[2]
