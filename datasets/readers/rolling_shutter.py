@@ -17,8 +17,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from trihedron.datasets.readers.registration import fixed_point
+from trihedron.datasets.readers.rolling_shutter_kernels import fit_rotation, pixels_read
 from trihedron.pipeline.core.lie import skew
-from trihedron.pipeline.core.linalg import inv, matmul, norm, solve
+from trihedron.pipeline.core.linalg import inv, matmul, norm
 from trihedron.pipeline.core.types import F32, F64, U8, Camera, Frame
 
 WIDTH_PX = 160  # of the images compared, at most
@@ -92,7 +94,6 @@ class SteadyFrames:
         """The image, of colour or depth, with all rows `later_s` before the time of its middle one; as it was where no row would move by a twentieth
         of a pixel, or where one would turn too far to be seen."""
         camera, is_depth = self._camera, image.ndim == 2
-        how, border = (cv2.INTER_NEAREST, cv2.BORDER_CONSTANT) if is_depth else (cv2.INTER_LINEAR, cv2.BORDER_REPLICATE)
         if (0.5 * abs(readout_s) + abs(later_s)) * norm(rate) * max(camera.fx, camera.fy) < STILL_PX:
             return image
         turned, columns = np.empty_like(image), np.arange(camera.width, dtype=np.float32)
@@ -101,10 +102,12 @@ class SteadyFrames:
             return image
         for first in range(0, camera.height, BLOCK_ROWS):
             block = slice(first, first + BLOCK_ROWS)
-            x, y, z = (start[block, k, None] + slope[block, k, None] * columns for k in range(3))
-            cv2.remap(image, x / z, y / z, how, dst=turned[block], borderMode=border)
+            x, y, factors = pixels_read(start[block], slope[block], columns)
             if is_depth:
-                turned[block] /= z
+                cv2.remap(image, x, y, cv2.INTER_NEAREST, dst=turned[block], borderMode=cv2.BORDER_CONSTANT)
+                turned[block] /= factors
+            else:
+                cv2.remap(image, *fixed_point(x, y), cv2.INTER_LINEAR, dst=turned[block], borderMode=cv2.BORDER_REPLICATE)
         return turned
 
     def _rate(self, number: int) -> F64 | None:
@@ -172,15 +175,10 @@ def rotation_between(first: U8, second: U8, camera: Camera, readout: float) -> F
     center, focal = np.array([camera.cx, camera.cy]), np.array([camera.fx, camera.fy])
     before, after = ((scale * (p[good, 0].astype(np.float64) + 0.5) - 0.5 - center) / focal for p in (corners, found))
     times = 1.0 + readout * camera.fy / camera.height * (after[:, 1] - before[:, 1])
-    x, y = (0.5 * (before + after)).T
-    ones = np.ones_like(x)
-    J = np.stack([-x * y, ones + x * x, -y, -ones - y * y, x * y, x], axis=-1).reshape(-1, 2, 3) * times[:, None, None]
-    flow, weights, turn = after - before, ones, np.zeros(3)
+    weights, turn = np.ones(len(times)), np.zeros(3)
     for _ in range(ROUNDS):
-        A = (J * weights[:, None, None]).reshape(-1, 3)
-        turn = solve(matmul(A.T, J.reshape(-1, 3)) + 1e-9 * np.eye(3), matmul(A.T, flow.reshape(-1)))
-        errors = np.sqrt(np.sum((flow - matmul(J, turn)) ** 2, axis=1))
-        weights = 1.0 / (1.0 + (errors / max(1.4826 * float(np.median(errors)), NOISE_PX * scale / camera.fx)) ** 2)
+        turn, errors = fit_rotation(before, after, times, weights)
+        weights = 1.0 / (1.0 + (errors / max(1.4826 * float(np.sort(errors)[len(errors) // 2]), NOISE_PX * scale / camera.fx)) ** 2)
     return turn
 
 

@@ -49,7 +49,12 @@ ALL = (
 )  # and before a live run: also what a surface, a loss, the way back and a loop need
 BUILDING, LIVE = (*ROOM, "outputs=[trajectory,building]"), (*ROOM, "live=true")
 AGAIN = ("replay={folder}/1/run.mcap", "only=[surface]", "outputs=[trajectory,surface]")  # of the second run of a process
-WHEEL = (ALL[0], (POINTS, ROOM, AGAIN, BUILDING, LIVE, *ALL[1][1:]))  # and for a wheel: also buildings and replays
+RECORDED = ("dataset.length=4", "record.frames=true")  # in the size of a Kinect's images
+KINECT = ("dataset=mcap", f"dataset.path={{folder}}/{len(ALL[0])}/run.mcap", "dataset.camera=seven_scenes")
+WHEEL = (
+    (*ALL[0], RECORDED, KINECT),
+    (POINTS, ROOM, AGAIN, BUILDING, LIVE, *ALL[1][1:]),
+)  # and for a wheel: also buildings, replays, images of a Kinect
 PARTS = {"tracking": TRACKING, "all": ALL, "wheel": WHEEL}
 LATER = "surfaces, loops, a loss and relocalisation"
 # What the line about compiling names, and how many functions both processes compile, about; numba's own are compiled by each
