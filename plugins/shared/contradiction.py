@@ -14,6 +14,8 @@ from trihedron.plugins.shared.plane_offsets import contradicting_offsets
 from trihedron.plugins.shared.plane_turns import contradicting_turn
 
 AVERAGED_FRAMES = 10  # that the disagreement of points is averaged over
+AGREEING_POINTS = 100  # in a frame, that outweigh its planes
+FEW_DISAGREE = 0.25  # share of the matched points of late up to which they do: with frozen colour 0.65 to 0.85 disagree, with an inexact map 0.1
 MOST_DISAGREEMENT = 0.5  # of points: more is no moment of blur and nobody who walks by; at most 0.35 of five cameras as they are stated
 
 
@@ -24,8 +26,10 @@ def contradiction_so_far(pose: Pose) -> str:
 
 def contradicting_depth(pose: Pose) -> str:
     """Return why depth contradicts colour or the map up to a pose, empty where it does not. Where most points disagree, something may move over half
-    the image; planes are large and seldom move, and what moves keeps its size."""
-    return contradicting_offsets(pose) or contradicting_turn(pose) or contradicting_scale(pose)
+    the image; planes are large and seldom move, and what moves keeps its size. Planes that are off while points, which have depth, too, are where the
+    map has them, contradict those as well: the map is inexact there."""
+    outweighed = pose.inliers[0] >= AGREEING_POINTS and pose.disagreement <= FEW_DISAGREE
+    return (contradicting_offsets(pose) if not outweighed else "") or contradicting_turn(pose) or contradicting_scale(pose)
 
 
 def disagreement(previous: Pose, matched: int, agreed: int) -> float:

@@ -7,7 +7,7 @@ import pytest
 
 from trihedron.pipeline.core.types import Planes, Pose
 from trihedron.plugins.pose.judgement import judge_by_run
-from trihedron.plugins.shared.contradiction import contradiction_so_far
+from trihedron.plugins.shared.contradiction import contradicting_depth, contradiction_so_far
 from trihedron.plugins.shared.plane_offsets import plane_offset, with_plane_offsets
 
 FIRST = Pose(0, 0, np.eye(4), np.eye(6), np.eye(4), -1, np.zeros(3, np.int32), 0, "ok", "")
@@ -91,6 +91,15 @@ def test_planes_that_lie_elsewhere_than_usual_are_a_contradiction():
     judged = judge_by_run(frozen[8], planes_agree=False)
     assert judged.status == "degraded"
     assert judged.reason == "planes contradict the map: of late they lie 3.3 % of their distance from where it has them, usually 0.6 %"
+
+
+@pytest.mark.parametrize(("points", "disagreement", "contradicts"), [(100, 0.2, False), (99, 0.2, True), (100, 0.3, True)])
+def test_points_that_agree_outweigh_planes(points, disagreement, contradicts):
+    """Depth of points is measured, too: where a hundred of them, and three quarters of late, are where the map has them, planes that are not are no
+    contradiction of depth and map."""
+    off = followed(followed(FIRST, 40, 0.005)[-1], 20, 0.05)[-1]
+    with_points = dataclasses.replace(off, inliers=np.array([points, 0, 0], np.int32), disagreement=disagreement)
+    assert bool(contradicting_depth(with_points)) is contradicts and contradicting_depth(off)
 
 
 @pytest.mark.parametrize("off", [0.0, 0.002, 0.05])
