@@ -32,21 +32,22 @@ class Undistortion:
     distortion: tuple[float, ...]
 
     @cached_property
-    def _fixed(self) -> tuple[NDArray[np.int16], NDArray[np.uint16]]:
-        return fixed_point(*self._maps)
-
-    @cached_property
     def _maps(self) -> tuple[F32, F32]:
         """(h, w) x and y in the distorted image of each pixel of the undistorted one."""
         size = self.camera.width, self.camera.height
         x, y = cv2.initUndistortRectifyMap(self.camera.K, np.array(self.distortion), np.eye(3), self.camera.K, size, cv2.CV_32FC1)
         return np.asarray(x), np.asarray(y)
 
+    @cached_property
+    def _color_maps(self) -> tuple[NDArray[np.int16], NDArray[np.uint16]]:
+        """The maps, rounded as by `fixed_point`."""
+        return fixed_point(*self._maps)
+
     def color(self, image: U8) -> U8:
         """(h, w, 3) RGB, undistorted."""
         if not self.distortion:
             return image
-        return np.asarray(cv2.remap(image, *self._fixed, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8)
+        return np.asarray(cv2.remap(image, *self._color_maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8)
 
     def depth(self, depth_m: F32) -> F32:
         """(h, w) metres, undistorted."""

@@ -15,7 +15,7 @@ from trihedron.plugins.shared.plane_turns import contradicting_turn
 
 AVERAGED_FRAMES = 10  # that the disagreement of points is averaged over
 AGREEING_POINTS = 100  # in a frame, that outweigh its planes
-FEW_DISAGREE = 0.25  # share of the matched points of late up to which they do: with frozen colour 0.65 to 0.85 disagree, with an inexact map 0.1
+FEW_DISAGREE = 0.25  # share of the matched points of late up to which they do: 0.1 where a map is inexact; where colour froze it comes to 0.45 to 0.6
 MOST_DISAGREEMENT = 0.5  # of points: more is no moment of blur and nobody who walks by; at most 0.35 of five cameras as they are stated
 
 
