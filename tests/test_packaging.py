@@ -85,8 +85,7 @@ def test_content_of_the_wheel(wheel):
 def test_benchmarks_of_the_wheel(words, code, said, wheel, tmp_path):
     """Those of the source checkout say so in one line; the others are there."""
     zipfile.ZipFile(wheel).extractall(tmp_path / "site")
-    program = "import sys; from trihedron.pipeline.app.cli import main; sys.exit(main(sys.argv[1:]))"
-    command = [sys.executable, "-c", program, "benchmark", *words.split()]
+    command = [sys.executable, "-m", "trihedron", "benchmark", *words.split()]
     environment = {**os.environ, "PYTHONPATH": str(tmp_path / "site")}
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, env=environment)
     assert done.returncode == code and done.stderr.startswith(f"trihedron: {said}") and done.stderr.count("\n") == 1, done.stderr

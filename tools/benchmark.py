@@ -48,8 +48,9 @@ from trihedron.tools.arguments import Parser
 from trihedron.tools.benchmark_comparison import comparison_table, read_figures, times
 from trihedron.tools.peers.side_by_side import find_peer, own_figures, peer_figures, side_by_side, write_job
 
-PROGRAM = (sys.executable, "-c", "import sys; from trihedron.pipeline.app.cli import main; sys.exit(main(sys.argv[1:]))")
-ON_ONE_CORE = (*PROGRAM[:2], "import os; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))}); " + PROGRAM[2])  # Linux
+PROGRAM = (sys.executable, "-m", "trihedron")
+ON_CORE = "import os, runpy; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))}); runpy.run_module('trihedron', run_name='__main__')"  # Linux
+ON_ONE_CORE = (sys.executable, "-c", ON_CORE)
 REFERENCE_FRAMES = 40  # at most
 OF_CHECKOUT = "trihedron.tools.benchmarks"  # which wheels lack
 COMPARISONS = {  # other words after `benchmark`, and whose `main` they stand for

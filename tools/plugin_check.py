@@ -322,8 +322,7 @@ class PluginCheck:
         return Result("threads", same, f"{WORKERS} at once give {'the same' if same else 'other'} bytes")
 
     def _processes(self) -> Result:
-        program = "import sys; from trihedron.pipeline.app.cli import main; sys.exit(main(sys.argv[1:]))"
-        words = [sys.executable, "-c", program, "check", self.slot, self.name, *self.words, "--digest"]
+        words = [sys.executable, "-m", "trihedron", "check", self.slot, self.name, *self.words, "--digest"]
         done = subprocess.run(words, capture_output=True, text=True)
         if done.returncode:
             return Result("processes", False, (done.stderr.strip().splitlines() or ["failed"])[-1])

@@ -14,7 +14,8 @@ DAMPING = 1e-9  # of a rotation that few corners determine
 
 @kernel
 def pixels_read(start: F32, slope: F32, columns: F32) -> tuple[F32, F32, F32]:
-    """Compute x, y and the factor of depth, each (h, w), in the image that was read, from the lines (h, 3) of the rows as by `row_lines`."""
+    """Compute where the pixels (h, w) of one moment are in the image that was read: x, y and the factor of depth, from `row_lines` (h, 3) and the
+    numbers (w,) of the columns."""
     h, w = len(start), len(columns)
     xs, ys, factors = np.empty((h, w), np.float32), np.empty((h, w), np.float32), np.empty((h, w), np.float32)
     for r in range(h):
@@ -28,8 +29,8 @@ def pixels_read(start: F32, slope: F32, columns: F32) -> tuple[F32, F32, F32]:
 
 @kernel
 def fit_rotation(before: F64, after: F64, times: F64, weights: F64) -> tuple[F64, F64]:
-    """Fit the rotation vector (3,) that moves points `before` (n, 2), on the plane z = 1, to `after` within `times` (n,) of it, by weighted least
-    squares; also returns the distances (n,) that remain."""
+    """Fit the rotation vector (3,) of a camera that moves image points (n, 2), in focal lengths, from `before` to `after`, by weighted least squares;
+    also returns the distances (n,) that remain. `times` (n,) is the share of the rotation that acts on each point: the later it is read, the more."""
     A, b, turn, J, errors = np.zeros((3, 3)), np.zeros(3), np.zeros(3), np.empty((2, 3)), np.empty(len(before))
     for i in range(len(before)):
         _flow_by_rotation(before, after, times, i, J)

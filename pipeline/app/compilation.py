@@ -62,7 +62,7 @@ SHOWN = {
     "tracking": ("of tracking", 675),
     "all": (f"of tracking, {LATER}", 815),
     "later": (f"of {LATER}", 210),  # what `all` compiles after `tracking`
-    "wheel": ("of all that a wheel brings", 865),
+    "wheel": ("of all that a wheel brings", 885),
 }
 SHORT = 150  # frames of a run that hardly closes a loop
 STAGES = {"keypoints", "lines", "planes", "manhattan"}  # of the graphs that these runs compile most of

@@ -516,9 +516,14 @@ def test_a_broken_plugin_package_disables_only_itself(tmp_path, module):
     assert done.returncode == 2 and done.stderr.splitlines()[-1].endswith(f"it may be in mine (mine), which does not load: {why}")
 
 
-def test_the_command_is_a_module_too():
+@pytest.mark.parametrize(
+    ("word", "code", "out", "error"),
+    [
+        ("--version", 0, f"trihedron {version('trihedron')}\n", ""),
+        ("rnu", 2, "", "trihedron: rnu: there is no such command; did you mean 'run'?\n"),
+    ],
+)
+def test_the_command_is_a_module_too(word, code, out, error):
     """For a shell that does not find the command on its path."""
-    done = subprocess.run([sys.executable, "-m", "trihedron", "--version"], capture_output=True, text=True)
-    assert (done.returncode, done.stdout, done.stderr) == (0, f"trihedron {version('trihedron')}\n", "")
-    done = subprocess.run([sys.executable, "-m", "trihedron", "rnu"], capture_output=True, text=True)
-    assert (done.returncode, done.stderr) == (2, "trihedron: rnu: there is no such command; did you mean 'run'?\n")
+    done = subprocess.run([*PROGRAM, word], capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (code, out, error)

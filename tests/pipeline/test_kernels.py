@@ -22,7 +22,7 @@ from trihedron.pipeline.run import warm_up
 ROOT = Path(__file__).parents[2]
 MODULES = [path for folder in ("pipeline", "plugins", "datasets", "tools") for path in sorted((ROOT / folder).rglob("*.py"))]
 PUBLIC = {"numba", "numba.types", "numba.typed", "numba.extending", "numba.core.event"}  # as numba's documentation lists them
-RUN = [sys.executable, "-c", "import sys; from trihedron.pipeline.app.cli import main; sys.exit(main(sys.argv[1:]))", "run"]
+RUN = [sys.executable, "-m", "trihedron", "run"]
 SMALL = ["dataset.width=160", "dataset.height=120", "dataset.frames=0:2", "outputs=[keypoints]"]
 COMPILES = "for this machine, once"
 

@@ -22,7 +22,6 @@ from trihedron.plugins.pose.open3d_odometry import OdometryMethod, Open3dOdometr
 from trihedron.tools.plugin_check import PluginCheck, room, values_of
 
 CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
-PROGRAM = "import sys; from trihedron.pipeline.app.cli import main; sys.exit(main(sys.argv[1:]))"
 
 
 def scene(outliers):
@@ -121,7 +120,7 @@ def test_words_are_made_of_binary_and_of_histogram_descriptors():
 @pytest.mark.slow
 def test_the_system_of_libraries_tracks_the_room(tmp_path):
     words = ["graph=libraries", "dataset.length=40", "outputs=[trajectory,surface]", f"out={tmp_path}"]
-    done = subprocess.run([sys.executable, "-c", PROGRAM, "run", *words], capture_output=True, text=True)
+    done = subprocess.run([sys.executable, "-m", "trihedron", "run", *words], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert metrics["final"]["tracked_share"] == 1.0 and metrics["final"]["ate_rmse_m"] < 0.03

@@ -10,8 +10,6 @@ from trihedron.pipeline.app.cli import main
 from trihedron.pipeline.core.slots import SLOTS
 from trihedron.tools.new_plugin import package_of
 
-PROGRAM = "import sys; from trihedron.pipeline.app.cli import main; sys.exit(main(sys.argv[1:]))"
-
 
 def test_a_plugin_of_every_slot_registers():
     """In a process of its own: names of plugins are for good."""
@@ -32,8 +30,8 @@ def test_a_package_installs_passes_the_check_and_tracks(tmp_path, monkeypatch, c
     subprocess.run(install, check=True, capture_output=True)
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(site), os.environ.get("PYTHONPATH", "")])}
     commands = [
-        [sys.executable, "-c", PROGRAM, "check", "planes", "my_planes"],
-        [sys.executable, "-c", PROGRAM, "run", "planes=my_planes", "dataset.length=10", "out=run"],
+        [sys.executable, "-m", "trihedron", "check", "planes", "my_planes"],
+        [sys.executable, "-m", "trihedron", "run", "planes=my_planes", "dataset.length=10", "out=run"],
         [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "trihedron-my-planes"],
     ]
     for command in commands:
