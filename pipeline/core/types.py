@@ -326,17 +326,18 @@ class Pose(Value):
 
     `repeats` is the number of images in a row, up to this one, of which all or most repeats the one before bit for bit, in colour and depth, or in
     colour while planes disagree; `disagreement` the share of the matched points that do not agree with their frame's pose, as a moving average over
-    ten frames. `jumps` is the number of frames in a row, up to this one, to which the camera moved as nothing does that is carried. `lost_from` is
-    the number of the first frame of the latest loss, or of a later jump, 0 for none, and `missing` the share of the points mapped before it that
-    should have been matched since the camera was found again and were not, as a moving average over a thousand of them; `confirmations` the number of
-    frames in a row since, at most three, that would be ok but for the loss, and with which planes agree. `turn_difference` is the rotation (rad,
-    camera frame) by which planes turned more than the pose, as a moving average over ten frames, and `usual_turn_difference` its usual size in one
-    frame, 0.3° before the first. `plane_offsets` are how far half of the area of the matched planes lies at least from where the map has them, as a
-    share of its distance, less where the calibration explains it, as moving averages over ten images full of matched planes and over a hundred, and
-    how many such images there were, at most a hundred. `usual_accelerations` are the number of frames, at most ten, whose linear (m/s²) and angular
-    (rad/s²) acceleration is known, and the largest of these, less 1 % for each frame since. `scale_difference` is the logarithm of the ratio by which
-    nine of ten distances between matched points are larger than in the map, or below 0 smaller (0 where neither is so), as a moving average over
-    three frames.
+    ten frames; `depth_disagreement` the share, of those that the image shows where the map has them, whose depth is another, as a moving average over
+    three frames, and `usual_depth_disagreement` over thirty. `jumps` is the number of frames in a row, up to this one, to which the camera moved as
+    nothing does that is carried. `lost_from` is the number of the first frame of the latest loss, or of a later jump, 0 for none, and `missing` the
+    share of the points mapped before it that should have been matched since the camera was found again and were not, as a moving average over a
+    thousand of them; `confirmations` the number of frames in a row since, at most three, that would be ok but for the loss, and with which planes
+    agree. `turn_difference` is the rotation (rad, camera frame) by which planes turned more than the pose, as a moving average over ten frames, and
+    `usual_turn_difference` its usual size in one frame, 0.3° before the first. `plane_offsets` are how far half of the area of the matched planes
+    lies at least from where the map has them, as a share of its distance, less where the calibration explains it, as moving averages over ten images
+    full of matched planes and over a hundred, and how many such images there were, at most a hundred. `usual_accelerations` are the number of frames,
+    at most ten, whose linear (m/s²) and angular (rad/s²) acceleration is known, and the largest of these, less 1 % for each frame since.
+    `scale_difference` is the logarithm of the ratio by which nine of ten distances between matched points are larger than in the map, or below 0
+    smaller (0 where neither is so), as a moving average over three frames.
 
     Five fields are what the pose's error owes to an imperfect calibration (`plugins.shared.calibration_error`, which defines the parameters and their
     units): `sensitivity` is the derivative of the error by them, `calibration_information` and `calibration_score` the information of the residuals
@@ -377,6 +378,8 @@ class Pose(Value):
     jumps: int = 0
     usual_accelerations: Annotated[F64, Shape(3), Finite()] = field(default_factory=lambda: np.zeros(3))
     scale_difference: Annotated[float, Finite()] = 0.0
+    depth_disagreement: Annotated[float, Within(0.0, 1.0)] = 0.0
+    usual_depth_disagreement: Annotated[float, Within(0.0, 1.0)] = 0.0
 
     @property
     def local_covariance(self) -> F64:

@@ -50,6 +50,7 @@ from trihedron.plugins.shared.contradiction import with_averages_of
 from trihedron.plugins.shared.distance_scale import with_scale_difference
 from trihedron.plugins.shared.plane_offsets import with_plane_offsets
 from trihedron.plugins.shared.plane_turns import with_turn_difference
+from trihedron.plugins.shared.point_depths import with_depth_disagreement
 from trihedron.plugins.shared.pose_optimizer import PoseSolution
 
 EYE = np.eye(3)
@@ -127,6 +128,7 @@ class Refine(JudgementOptions):
         pose = with_disagreement(with_turn_difference(pose, previous, tracks, planes), previous, inliers, static)
         points_known, _, planes_known = problem.terms(T)
         pose = with_scale_difference(pose, previous, points_known.positions_m, keypoints.points_m[matches.keypoints[:, 0]])
+        pose = with_depth_disagreement(pose, previous, camera, points_known, solution.points)
         sigmas_m = plane_sigmas_m(pose, problem)
         pose = with_plane_offsets(pose, previous, planes_known.coefficients[: len(matches.planes)], planes, matches.planes, sigmas_m)
         pose = with_missing_points(since_loss(pose, previous), previous, problem)

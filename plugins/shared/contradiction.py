@@ -1,8 +1,8 @@
 """Contradictions between colour, depth and the map that last for several frames: such a pose is not ok, and is not mapped.
 
 Each is a share, a ratio or a rotation averaged over the latest frames: matched points that disagree with their pose; planes that lie elsewhere than
-in the map (`plane_offsets.py`); planes that turn otherwise than the camera (`plane_turns.py`); and distances between points that are not those of
-the map (`distance_scale.py`)."""
+in the map (`plane_offsets.py`); points that disagree in depth alone (`point_depths.py`); planes that turn otherwise than the camera
+(`plane_turns.py`); and distances between points that are not those of the map (`distance_scale.py`)."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from trihedron.pipeline.core.types import Pose
 from trihedron.plugins.shared.distance_scale import contradicting_scale
 from trihedron.plugins.shared.plane_offsets import contradicting_offsets
 from trihedron.plugins.shared.plane_turns import contradicting_turn
+from trihedron.plugins.shared.point_depths import contradicting_depths
 
 AVERAGED_FRAMES = 10  # that the disagreement of points is averaged over
 AGREEING_POINTS = 100  # in a frame, that outweigh its planes
@@ -29,7 +30,8 @@ def contradicting_depth(pose: Pose) -> str:
     the image; planes are large and seldom move, and what moves keeps its size. Planes that are off while points, which have depth, too, are where the
     map has them, contradict those as well: the map is inexact there."""
     outweighed = pose.inliers[0] >= AGREEING_POINTS and pose.disagreement <= FEW_DISAGREE
-    return (contradicting_offsets(pose) if not outweighed else "") or contradicting_turn(pose) or contradicting_scale(pose)
+    tests = contradicting_depths, contradicting_turn, contradicting_scale
+    return next(filter(None, (test(pose) for test in (tests if outweighed else (contradicting_offsets, *tests)))), "")
 
 
 def disagreement(previous: Pose, matched: int, agreed: int) -> float:
@@ -45,6 +47,8 @@ def with_averages_of(previous: Pose, pose: Pose) -> Pose:
     return replace(
         pose,
         disagreement=previous.disagreement,
+        depth_disagreement=previous.depth_disagreement,
+        usual_depth_disagreement=previous.usual_depth_disagreement,
         plane_offsets=previous.plane_offsets,
         usual_turn_difference=previous.usual_turn_difference,
         usual_accelerations=previous.usual_accelerations,

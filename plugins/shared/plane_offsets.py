@@ -17,7 +17,7 @@ from trihedron.pipeline.core.types import F32, F64, I32, Bool, Planes, Pose
 LATE, USUAL = 10.0, 100.0  # images full of matched planes that the offset of late, and the usual one, are averaged over
 MOST = 3.5  # times the usual offset, beyond which that of late contradicts the map; six sequences come to 2.8
 SIGMAS = 2.0  # standard deviations by the calibration that are no contradiction; offsets are 0.4 to 2.5 of them without a fault, 4 to 23 with one
-LEAST = 0.001  # of the distance, that is usual at least, also where depth is exact
+LEAST = 0.0005  # of the distance, that is usual at least, also where depth is exact
 LEARNED = 2.0  # times the usual offset that a frame counts at most in it: a fault of some seconds does not become usual, and a change for good does
 TINY_M = 1e-6
 

@@ -353,11 +353,11 @@ def test_a_value_of_an_older_version_names_the_version_and_the_fields():
     message.arrays.extend([*kept, type(kept[0])(name="quality", dtype="float", encoding="raw", data=bytes(8))])
     assert refusal(message) == (
         "a.mcap: topic /keypoints: holds Pose version 1, this program reads version 11, with the field 'calibration_information', "
-        "'calibration_score', 'confirmations', 'depth_scale_sigma', 'disagreement', 'jumps', 'keyframe_covariance', 'lost_from', 'map_covariance', "
-        "'missing', "
+        "'calibration_score', 'confirmations', 'depth_disagreement', 'depth_scale_sigma', 'disagreement', 'jumps', 'keyframe_covariance', "
+        "'lost_from', 'map_covariance', 'missing', "
         "'noise_scale', 'plane_offsets', 'reference_twist', "
         "'repeats', 'scale_difference', 'sensitivity', 'submap', 'turn_difference', 'twist', 'unrecognised', "
-        "'usual_accelerations', 'usual_turn_difference' "
+        "'usual_accelerations', 'usual_depth_disagreement', 'usual_turn_difference' "
         "that it lacks, "
         "without its field 'quality'; upgrade what can be read of it with: trihedron convert SRC DST.mcap"
     )

@@ -108,9 +108,9 @@ def test_what_is_usual_is_none(off):
     assert not any(map(contradiction_so_far, followed(FIRST, 100, off)))
 
 
-def test_what_is_less_than_a_third_of_a_per_cent_is_none():
-    """Depth without errors, after which planes are off by 3 mm at a metre."""
-    assert not any(map(contradiction_so_far, followed(followed(FIRST, 40, 0.0)[-1], 100, 0.003)))
+def test_what_is_less_than_a_sixth_of_a_per_cent_is_none():
+    """Depth without errors, after which planes are off by 1.5 mm at a metre."""
+    assert not any(map(contradiction_so_far, followed(followed(FIRST, 40, 0.0)[-1], 100, 0.0015)))
 
 
 def test_a_change_for_good_becomes_usual():
