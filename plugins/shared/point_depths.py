@@ -1,8 +1,8 @@
 """Contradiction between colour and depth: points that the image shows where the map has them are as far away as there.
 
 Where colour is frozen with noise, or late, points agree with each other on where the camera is by their pixels, and depth is that of another view.
-What moves, and what is matched wrongly, seldom stays where the image should show it. An imperfect calibration takes some depths beyond their noise in
-every frame, and a run shows how many that usually are."""
+What moves, and what is matched wrongly, lies elsewhere in the image, too, most of it. An imperfect calibration takes some depths beyond their noise
+in every frame, and a run shows how many that usually are."""
 
 from __future__ import annotations
 
@@ -23,14 +23,18 @@ LEARNED = 2.0  # times the usual share that a frame counts at most in it: a faul
 
 def with_depth_disagreement(pose: Pose, previous: Pose, camera: Camera, points: PointTerms, agreeing: U8) -> Pose:
     """Give a refined pose the moving averages of the share of points that disagree in depth alone, of those (n,) `points` that its image shows where
-    the map has them; 0 in `agreeing` (n,) are those that disagree in any way. The previous one's where there are few."""
+    the map has them; 0 in `agreeing` (n,) are those that disagree in any way. In that of late, a frame where most of these lie elsewhere in the
+    image, too, counts as none: something moves. The previous one's where there are few."""
     late, usual = previous.depth_disagreement, previous.usual_depth_disagreement
     pixels = classify_terms(pose.T_world_camera, camera, points._replace(depth_m=np.full(len(points.depth_m), np.nan))).points
-    shown = (pixels > 0) & np.isfinite(points.depth_m)
+    measured, disagreeing = np.isfinite(points.depth_m), agreeing == 0
+    shown = measured & (pixels > 0)
     count = np.count_nonzero(shown)
     if count >= FEWEST:
-        share = 1.0 - np.count_nonzero(agreeing[shown]) / count
-        late = late + (share - late) / LATE if usual else share
+        alone = np.count_nonzero(shown & disagreeing)
+        share = alone / count
+        counted = share if 2 * alone > np.count_nonzero(measured & disagreeing) else 0.0
+        late = late + (counted - late) / LATE if usual else counted
         usual = usual + (min(share, LEARNED * max(usual, LEAST)) - usual) / USUAL if usual else share
     return replace(pose, depth_disagreement=float(late), usual_depth_disagreement=float(usual))
 

@@ -39,9 +39,9 @@ def followed(pose, frames, terms):
 
 
 def test_the_share_is_of_the_points_that_the_image_shows_where_they_are():
-    """20 of 50; 30 lie elsewhere in the image, as what moves does, and 20 have no depth."""
-    pose = followed(FIRST, 1, points(off_in_depth=20, off_in_pixels=30, without_depth=20))[0]
-    assert (pose.depth_disagreement, pose.usual_depth_disagreement) == pytest.approx((0.4, 0.4))
+    """20 of 60; 19 lie elsewhere in the image, as what moves does, and 21 have no depth."""
+    pose = followed(FIRST, 1, points(off_in_depth=20, off_in_pixels=19, without_depth=21))[0]
+    assert (pose.depth_disagreement, pose.usual_depth_disagreement) == pytest.approx((1.0 / 3.0, 1.0 / 3.0))
 
 
 def test_few_points_leave_it_as_it_is():
@@ -75,5 +75,9 @@ def test_what_is_usual_is_none(off):
 
 
 def test_what_moves_is_none():
-    """Half of the points lie elsewhere in the image."""
+    """Half of the points lie elsewhere in the image; or a third, and as many where the image shows them, but elsewhere in depth."""
     assert not any(map(contradicting_depth, followed(FIRST, 60, points(off_in_pixels=50))))
+    clean = followed(FIRST, 40, points(off_in_depth=2))[-1]
+    moving = followed(clean, 20, points(off_in_depth=33, off_in_pixels=33))
+    assert not any(map(contradicting_depth, moving)) and moving[-1].usual_depth_disagreement > 0.08
+    assert contradicting_depth(followed(clean, 20, points(off_in_depth=33, off_in_pixels=32))[-1])
