@@ -351,17 +351,17 @@ def keyframes_at(T: F64, poses: F64, twists: F64, sensitivities: F64) -> Keyfram
 @kernel
 def sensitivity_and_evidence(equations: Equations, prior: F64, before: F64) -> tuple[F64, F64, F64]:
     """Return the error of a pose by the calibration (6, 12), `before` being that of its prior of information `prior` (6, 6); and the information
-    (12, 12) and score (12,) on the calibration that the residuals leave beside the pose."""
-    to_pose = inverse_positive(equations.H + prior)
-    sensitivity = matmul(to_pose, matmul(prior, before) - equations.C)
-    share = matmul(to_pose, equations.C)
-    information, score = equations.G.copy(), equations.s.copy()
+    (12, 12) and score (12,) on the calibration that the residuals leave beside the pose. What the prior and all keyframes err in common is none."""
+    to_pose, carried = inverse_positive(equations.H + prior), matmul(prior, before)
+    cross = equations.C - carried
+    share = matmul(to_pose, cross)
+    information, score = equations.G + matmul(before.T.copy(), carried), equations.s.copy()
     for a in range(CALIBRATION):
         for i in range(6):
             score[a] -= share[i, a] * equations.b[i]
             for k in range(CALIBRATION):
-                information[a, k] -= 0.5 * (share[i, a] * equations.C[i, k] + equations.C[i, a] * share[i, k])
-    return sensitivity, information, score
+                information[a, k] -= 0.5 * (share[i, a] * cross[i, k] + cross[i, a] * share[i, k])
+    return -share, information, score
 
 
 @kernel

@@ -17,6 +17,7 @@ from trihedron.plugins.shared.calibration_error_kernels import (
     calibration_moment,
     keypoint_errors,
     plane_point_error,
+    sensitivity_and_evidence,
 )
 from trihedron.plugins.shared.plane_offsets_kernels import distance_sigmas
 from trihedron.plugins.shared.pose_optimizer import NO_PLANES, solve_pose
@@ -85,6 +86,7 @@ def test_errors_of_measurements_are_those_of_a_camera_with_that_error(parameter)
 
 
 AT_REST = ((np.eye(4), np.zeros(6)),)
+NO_ERROR = np.zeros((6, CALIBRATION))
 MOVING = ((np.eye(4), TWIST[::-1]), (exp_se3(np.array([-0.1, 0.1, 0.0, 0.02, 0.03, 0.05])), -0.5 * TWIST))
 
 
@@ -112,13 +114,13 @@ def two_views(theta, keyframes=AT_REST):
     return points, np.concatenate(surfaces), T
 
 
-def keyframes_of(observers):
-    """Keyframes without an error of their own."""
+def keyframes_of(observers, errors=NO_ERROR):
+    """Keyframes that err alike by the calibration, as poses of the camera."""
     T, twists = (np.array(part) for part in zip(*observers))
-    return Keyframes(np.ascontiguousarray(T[:, :3, :3]), T[:, :3, 3].copy(), twists, np.zeros((len(T), 6, CALIBRATION)))
+    return Keyframes(np.ascontiguousarray(T[:, :3, :3]), T[:, :3, 3].copy(), twists, np.tile(errors, (len(T), 1, 1)))
 
 
-def equations_of(points, surfaces, T, keyframes=AT_REST):
+def equations_of(points, surfaces, T, keyframes=AT_REST, errors=NO_ERROR):
     """The equations at pose T of landmarks that all of these keyframes observed."""
     flags = Flags(np.ones(len(surfaces), np.uint8), np.empty(0, np.uint8), np.empty(0, np.uint8))
     seen_by = np.append(np.arange(len(keyframes), dtype=np.int32), np.int32(-1))  # and by none besides
@@ -126,7 +128,7 @@ def equations_of(points, surfaces, T, keyframes=AT_REST):
     samples, size = np.empty((0, 8, 3), np.float32), (CAMERA.width, CAMERA.height)
     return calibration_equations(
         T, CAMERA.intrinsics, *size, calibration_scales(CAMERA), TWIST, points, NO_PLANES, flags, surfaces, samples, observers,
-        keyframes_of(keyframes),
+        keyframes_of(keyframes, errors),
     )  # fmt: skip
 
 
@@ -158,6 +160,20 @@ def test_residuals_tell_of_the_calibration():
     assert error @ np.linalg.solve(covariance, error) < CALIBRATION
     assert error @ error < 0.7 * (true @ true)
     assert np.trace(covariance) < 0.7 * CALIBRATION
+
+
+def test_what_all_keyframes_err_in_common_tells_nothing_of_the_calibration():
+    """Keyframes that err as the prior of the pose does: a drift of one degree for each parameter, which a prior of 0.1° would otherwise deny."""
+    true = 0.2 * np.random.default_rng(2).normal(0.0, 1.0, CALIBRATION)
+    points, surfaces, T = two_views(true * calibration_scales(CAMERA))
+    T = solve_pose(T, CAMERA, T, 1e-6 * np.eye(6), points).T_world_camera
+    prior, drift = np.diag([1e4] * 3 + [1.0 / np.radians(0.1) ** 2] * 3), np.radians(1.0) * np.random.default_rng(3).normal(size=(6, CALIBRATION))
+    exact, carried = (equations_of(points, surfaces, T, errors=errors) for errors in (NO_ERROR, drift))
+    sensitivity, information, score = sensitivity_and_evidence(exact, prior, NO_ERROR)
+    with_drift = sensitivity_and_evidence(carried, prior, drift)
+    assert with_drift[0] == pytest.approx(sensitivity + drift, rel=1e-9)
+    assert with_drift[1] == pytest.approx(information, rel=1e-6, abs=1e-6 * np.abs(information).max())
+    assert with_drift[2] == pytest.approx(score, rel=1e-6, abs=1e-6 * np.abs(score).max())
 
 
 def test_of_a_plane_count_the_samples_that_both_views_show():
