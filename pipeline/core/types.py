@@ -660,7 +660,9 @@ class Map(Value):
 @dataclass(frozen=True)
 class Correction(Value):
     """New poses of keyframes and positions of landmarks, by id, from bundle adjustment or loop closing of revision `based_on`. `*_information`
-    (world, 1/m²; of each end of a line) and `plane_covariance`, of (a, b, d), replace those of the map: no measurement is counted twice."""
+    (world, 1/m²; of each end of a line) and `plane_covariance`, of (a, b, d), replace those of the map: no measurement is counted twice.
+    `sensitivity` is that of the corrected keyframes to the calibration, and `added_covariance` what their poses are more uncertain by; both are of no
+    keyframe where these stay as they are."""
 
     version: ClassVar[int] = 2
 
@@ -676,6 +678,8 @@ class Correction(Value):
     plane_ids: Annotated[I32, Shape("p"), IndexInto("map.planes")]
     coefficients: Annotated[F64, Shape("p", 4), UnitNormals()]
     plane_covariance: Annotated[F64, Shape("p", 3, 3)]
+    sensitivity: Annotated[F64, Shape("s", 6, CALIBRATION), Finite()] = field(default_factory=lambda: np.zeros((0, 6, CALIBRATION)), kw_only=True)
+    added_covariance: Annotated[F64, Shape("s", 6, 6), Finite()] = field(default_factory=lambda: np.zeros((0, 6, 6)), kw_only=True)
 
 
 PLACES = Columns({"keyframe": ("i4", (), IndexInto("map.keyframes")), "descriptor": ("f4", (None,), Finite())})

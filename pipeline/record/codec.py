@@ -257,9 +257,9 @@ def timing_of(data: bytes) -> dict[str, Any]:
 
 
 def _make(kind: Any, fields: Mapping[str, Any], prefix: str) -> Any:
-    """Rebuild a (nested) dataclass from dotted fields; a number or text that a message does not hold, written before the field was added, is the
-    field's default."""
-    later = {one.name for one in dataclasses.fields(kind) if one.default is not dataclasses.MISSING}
+    """Rebuild a (nested) dataclass from dotted fields; what a message does not hold, written before the field was added, is the field's default."""
+    missing = dataclasses.MISSING
+    later = {one.name for one in dataclasses.fields(kind) if one.default is not missing or one.default_factory is not missing}
     made = {}
     for name, hint in hints_of(kind).items():
         if prefix + name in fields or is_nested(hint) or name not in later:

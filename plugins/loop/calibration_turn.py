@@ -6,19 +6,30 @@ where they turn from keyframe to keyframe as a wrong calibration would turn them
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from trihedron.pipeline.core.geometry import invert
 from trihedron.pipeline.core.lie import adjoint
-from trihedron.pipeline.core.linalg import matmul, solve
-from trihedron.pipeline.core.types import F64, I32
+from trihedron.pipeline.core.linalg import inv, matmul, solve
+from trihedron.pipeline.core.types import CALIBRATION, F64, I32
 
 LEAST_F = 10.0  # of Fisher's test; at most 9.5 of 2400 maps whose directions err at random, together over one to eight keyframes
 
 
-def errors_by_calibration(poses: F64, rotations: F64, information: F64, sensitivity: F64, since: int) -> F64:
-    """Return xi (k, 6) of `T_world_camera · Exp(xi)` that undoes what the calibration did to keyframes at `poses` (k, 4, 4) since the first of them,
-    zeros where their directions do not show it.
+@dataclass(frozen=True)
+class Undone:
+    """Motions that undo the errors which the calibration gave to k keyframes, and the errors that they leave."""
+
+    xi: F64  # (k, 6) of `T_world_camera · Exp(xi)`
+    sensitivity: F64  # (k, 6, 12) that is left
+    covariance: F64  # (k, 6, 6) of xi, by the noise of the directions
+
+
+def errors_by_calibration(poses: F64, rotations: F64, information: F64, sensitivity: F64, since: int) -> Undone:
+    """Return what undoes what the calibration did to keyframes at `poses` (k, 4, 4) since the first of them; nothing where their directions do not
+    show it. What it undoes is linear in the same errors, so that those which are left are linear, too.
 
     `rotations` (k, 3) agree best with the axes, with `information` (k, 3, 3), see `ManhattanPrior`; `sensitivity` is (k, 6, 12). Keyframes up to the
     row `since` may have been corrected before, so that the calibration is estimated separately for them and for the later ones: by least squares with
@@ -35,12 +46,15 @@ def errors_by_calibration(poses: F64, rotations: F64, information: F64, sensitiv
     residuals = (y - matmul(rows, x)).reshape(-1, 3)
     total = (turned * matmul(W, turned[..., None])[..., 0]).sum()
     unexplained = total - matmul(b[:3], solve(H[:3, :3] + np.eye(3), b[:3]))
-    left = total - matmul(b, x)  # with the prior's part
+    rest = total - matmul(b, x)  # with the prior's part
     parameters = np.trace(solve(H + prior, H)) - 3.0
     freedom = 3.0 * _independent(matmul(W, residuals[..., None])[..., 0], residuals) - 3.0 - parameters
-    if freedom <= 0.0 or (unexplained - left) * freedom < LEAST_F * parameters * left:
-        return np.zeros((len(poses), 6))
-    return np.asarray(matmul(errors, x[3:]))
+    if freedom <= 0.0 or (unexplained - rest) * freedom < LEAST_F * parameters * rest:
+        return Undone(np.zeros((len(poses), 6)), sensitivity, np.zeros((len(poses), 6, 6)))
+    left = np.asarray(inv(H + prior), np.float64)
+    noise, left = matmul(left, H, left)[3:, 3:], left[3:, 3:]
+    sensitivity = first + matmul(errors, left[:, :CALIBRATION] + left[:, CALIBRATION:])
+    return Undone(matmul(errors, x[3:]), sensitivity, matmul(errors, noise, np.swapaxes(errors, 1, 2)))
 
 
 def _carried(poses: F64, sensitivity: F64, rows: I32) -> F64:

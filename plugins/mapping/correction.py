@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from trihedron.pipeline.core.geometry import invert, rigid, transform, transform_each, transform_planes
+from trihedron.pipeline.core.lie import adjoint
 from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import F64, I32, Bool, Correction, Map, Table
 from trihedron.plugins.mapping.covisibility_graph import observed_by
@@ -26,6 +27,8 @@ def apply_correction(map: Map, correction: Correction) -> Map:
     known = correction.keyframe_ids < len(map.keyframes)
     ids, poses = correction.keyframe_ids[known], correction.T_world_keyframe[known]
     if len(ids):
+        if len(correction.sensitivity) == len(known):
+            map = _correct_errors(map, ids, correction.sensitivity[known], correction.added_covariance[known])
         map = _move_culled(map, ids, poses)
         map = _move_later(map, correction, int(ids.max()), poses[np.argmax(ids)])
         map = replace(map, keyframes=map.keyframes.updated(ids, T_world_camera=poses))
@@ -36,6 +39,26 @@ def apply_correction(map: Map, correction: Correction) -> Map:
     rows = _living(map.planes, correction.plane_ids)
     planes = _moved_planes(map.planes, correction.plane_ids[rows], correction.coefficients[rows], correction.plane_covariance[rows])
     return replace(map, points=points, lines=lines, planes=planes)
+
+
+def _correct_errors(map: Map, ids: I32, sensitivity: F64, added: F64) -> Map:
+    """Give keyframes a new sensitivity (k, 6, 12) to the calibration, and more covariance (k, 6, 6) in the world. Those inserted since the newest of
+    them still differ from it as they did."""
+    newest, later = int(ids.max()), _later(map, int(ids.max()))
+    T, old = map.keyframes.row("T_world_camera", newest), map.keyframes.row("sensitivity", newest)
+    poses, own = map.keyframes.columns_at(later, "T_world_camera", "sensitivity")
+    to_later, last = adjoint(matmul(invert(poses), T)), np.argmax(ids)
+    rows = np.concatenate([ids, later])
+    sensitivity = np.concatenate([sensitivity, own + matmul(to_later, sensitivity[last] - old)])
+    added = np.concatenate([added, matmul(to_later, added[last], np.swapaxes(to_later, 1, 2))])
+    covariance = map.keyframes.rows("world_covariance", rows) + added
+    return replace(map, keyframes=map.keyframes.updated(rows, sensitivity=sensitivity, world_covariance=covariance))
+
+
+def _later(map: Map, newest: int) -> I32:
+    """Keyframes of the same sub-map that were inserted after this one."""
+    later = np.arange(newest + 1, len(map.keyframes), dtype=np.int32)
+    return np.asarray(later[map.keyframes.rows("submap", later) == map.keyframes.row("submap", newest)])
 
 
 def _living(table: Table, ids: I32) -> Bool:
@@ -65,8 +88,7 @@ def _move_culled(map: Map, ids: I32, poses: F64) -> Map:
 
 def _move_later(map: Map, correction: Correction, newest: int, T_corrected: F64) -> Map:
     """Move what was added after the newest corrected keyframe, in its sub-map, along with it."""
-    later = np.arange(newest + 1, len(map.keyframes), dtype=np.int32)
-    later = later[map.keyframes.rows("submap", later) == map.keyframes.rows("submap", np.array([newest]))]
+    later = _later(map, newest)
     if not len(later):
         return map
     T = rigid(matmul(T_corrected, invert(map.keyframes.row("T_world_camera", newest))))

@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trihedron.pipeline.core.geometry import transform, transform_planes
-from trihedron.pipeline.core.lie import exp_se3
+from trihedron.pipeline.core.geometry import invert, transform, transform_planes
+from trihedron.pipeline.core.lie import adjoint, exp_se3
 from trihedron.pipeline.core.table import CHUNK
+from trihedron.pipeline.core.types import CALIBRATION
 from trihedron.plugins.mapping import plane_fusion
 from trihedron.plugins.mapping.correction import apply_correction
 from trihedron.plugins.mapping.covisibility_graph import local_window, observed_by
@@ -77,6 +78,27 @@ def test_what_came_after_the_corrected_keyframes_moves_with_them():
     alive = after.lines.column("alive")
     assert np.allclose(after.lines.column("endpoints_m")[alive], transform(shift, map.lines.column("endpoints_m"))[alive])
     assert np.allclose(after.planes.column("coefficients"), transform_planes(shift, map.planes.column("coefficients")))
+
+
+def test_errors_by_the_calibration_are_corrected_with_the_keyframes():
+    """A correction of keyframes 0 to 2 takes half of their errors, with some noise, and arrives when keyframe 3 exists: that errs as keyframe 2,
+    carried there, and by what it differed from that before. A correction that names no errors leaves them."""
+    map = walk(World(), 4, stride=6)
+    sensitivity = np.random.default_rng(0).normal(size=(4, 6, CALIBRATION))
+    map = dataclasses.replace(map, keyframes=map.keyframes.updated(np.arange(4), sensitivity=sensitivity))
+    poses = map.keyframes.column("T_world_camera")
+    moved = correction(map, keyframe_ids=np.array([2, 0, 1], np.int32), T_world_keyframe=poses[[2, 0, 1]])
+    added = np.tile(0.01 * np.eye(6), (3, 1, 1))
+    half = dataclasses.replace(moved, sensitivity=0.5 * sensitivity[[2, 0, 1]], added_covariance=added)
+    to_last = adjoint(invert(poses[3]) @ poses[2])
+    before, after = map.keyframes.column("world_covariance"), apply_correction(map, half).keyframes
+    assert after.column("sensitivity")[:3] == pytest.approx(0.5 * sensitivity[:3])
+    assert after.column("sensitivity")[3] == pytest.approx(sensitivity[3] - 0.5 * to_last @ sensitivity[2])
+    assert after.column("world_covariance")[:3] == pytest.approx(before[:3] + added)
+    assert after.column("world_covariance")[3] == pytest.approx(before[3] + 0.01 * to_last @ to_last.T)
+    assert np.array_equal(apply_correction(map, moved).keyframes.column("sensitivity"), sensitivity)
+    stranger = dataclasses.replace(moved, sensitivity=sensitivity, added_covariance=np.zeros((4, 6, 6)))  # of four keyframes, for three
+    assert np.array_equal(apply_correction(map, stranger).keyframes.column("sensitivity"), sensitivity)
 
 
 def test_keyframes_that_others_make_redundant_are_retired():
