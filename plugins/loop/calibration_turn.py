@@ -19,17 +19,17 @@ LEAST_F = 10.0  # of Fisher's test; at most 9.5 of 2400 maps whose directions er
 
 
 @dataclass(frozen=True)
-class Undone:
-    """Motions that undo the errors which the calibration gave to k keyframes, and the errors that they leave."""
+class CalibrationErrors:
+    """Errors of k keyframes by the calibration, estimated by their directions."""
 
-    xi: F64  # (k, 6) of `T_world_camera · Exp(xi)`
-    sensitivity: F64  # (k, 6, 12) that is left
+    xi: F64  # (k, 6) of `T_world_camera · Exp(xi)`, which undoes them
+    sensitivity: F64  # (k, 6, 12) of the keyframes once they are undone
     covariance: F64  # (k, 6, 6) of xi, by the noise of the directions
 
 
-def errors_by_calibration(poses: F64, rotations: F64, information: F64, sensitivity: F64, since: int) -> Undone:
-    """Return what undoes what the calibration did to keyframes at `poses` (k, 4, 4) since the first of them; nothing where their directions do not
-    show it. What it undoes is linear in the same errors, so that those which are left are linear, too.
+def errors_by_calibration(poses: F64, rotations: F64, information: F64, sensitivity: F64, since: int) -> CalibrationErrors:
+    """Estimate the errors that the calibration gave to keyframes at `poses` (k, 4, 4) since the first of them; zeros where their directions do not
+    show them. The estimate is linear in the errors, and so are those that it leaves.
 
     `rotations` (k, 3) agree best with the axes, with `information` (k, 3, 3), see `ManhattanPrior`; `sensitivity` is (k, 6, 12). Keyframes up to the
     row `since` may have been corrected before, so that the calibration is estimated separately for them and for the later ones: by least squares with
@@ -50,11 +50,11 @@ def errors_by_calibration(poses: F64, rotations: F64, information: F64, sensitiv
     parameters = np.trace(solve(H + prior, H)) - 3.0
     freedom = 3.0 * _independent(matmul(W, residuals[..., None])[..., 0], residuals) - 3.0 - parameters
     if freedom <= 0.0 or (unexplained - rest) * freedom < LEAST_F * parameters * rest:
-        return Undone(np.zeros((len(poses), 6)), sensitivity, np.zeros((len(poses), 6, 6)))
-    left = np.asarray(inv(H + prior), np.float64)
+        return CalibrationErrors(np.zeros((len(poses), 6)), sensitivity, np.zeros((len(poses), 6, 6)))
+    left = np.asarray(inv(H + prior), np.float64)  # share of an error that is left: 1 - (H + prior)⁻¹ H, the prior being 1
     noise, left = matmul(left, H, left)[3:, 3:], left[3:, 3:]
     sensitivity = first + matmul(errors, left[:, :CALIBRATION] + left[:, CALIBRATION:])
-    return Undone(matmul(errors, x[3:]), sensitivity, matmul(errors, noise, np.swapaxes(errors, 1, 2)))
+    return CalibrationErrors(matmul(errors, x[3:]), sensitivity, matmul(errors, noise, np.swapaxes(errors, 1, 2)))
 
 
 def _carried(poses: F64, sensitivity: F64, rows: I32) -> F64:

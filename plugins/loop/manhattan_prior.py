@@ -128,10 +128,10 @@ def align_with_manhattan(options: StraighteningOptions, map: Map, since: int) ->
         return None
     before, sensitivity = map.keyframes.columns_at(prior.keyframes, "T_world_camera", "sensitivity")
     last = max(int(np.searchsorted(prior.keyframes, since, "right")) - 1, 0)
-    undone = errors_by_calibration(before, prior.rotations, prior.information, sensitivity, last)
-    moved = matmul(before, np.array([exp_se3(x) for x in undone.xi]))
+    errors = errors_by_calibration(before, prior.rotations, prior.information, sensitivity, last)
+    moved = matmul(before, np.array([exp_se3(x) for x in errors.xi]))
     at_moved = replace(map, keyframes=map.keyframes.updated(prior.keyframes, T_world_camera=moved))
-    rest = replace(prior, rotations=prior.rotations - undone.xi[:, 3:])
+    rest = replace(prior, rotations=prior.rotations - errors.xi[:, 3:])
     after = _solve_with_prior(moved, odometry_edges(options, at_moved, prior.keyframes), rest)
     path_m = np.linalg.norm(np.diff(moved[:, :3, 3], axis=0), axis=1).sum()
     if _angles(moved, after).max() > PLAUSIBLE * np.radians(options.rotation_drift_deg) * np.sqrt(path_m):
@@ -139,7 +139,9 @@ def align_with_manhattan(options: StraighteningOptions, map: Map, since: int) ->
     if _angles(before, after)[-1] < np.radians(options.straighten_deg):
         return None
     correction = correct_keyframes(map, prior.keyframes, before, after)
-    return replace(correction, sensitivity=undone.sensitivity, added_covariance=undone.covariance)
+    if not errors.xi.any():
+        return correction
+    return replace(correction, sensitivity=errors.sensitivity, added_covariance=errors.covariance)
 
 
 def _angles(before: F64, after: F64) -> F64:

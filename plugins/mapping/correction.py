@@ -27,10 +27,11 @@ def apply_correction(map: Map, correction: Correction) -> Map:
     known = correction.keyframe_ids < len(map.keyframes)
     ids, poses = correction.keyframe_ids[known], correction.T_world_keyframe[known]
     if len(ids):
+        last, later = int(np.argmax(ids)), _later(map, int(ids.max()))
         if len(correction.sensitivity) == len(known):
-            map = _correct_errors(map, ids, correction.sensitivity[known], correction.added_covariance[known])
+            map = _correct_errors(map, ids, last, later, correction.sensitivity[known], correction.added_covariance[known])
         map = _move_culled(map, ids, poses)
-        map = _move_later(map, correction, int(ids.max()), poses[np.argmax(ids)])
+        map = _move_later(map, correction, int(ids[last]), later, poses[last])
         map = replace(map, keyframes=map.keyframes.updated(ids, T_world_camera=poses))
     rows = _living(map.points, correction.point_ids)
     points = map.points.updated(correction.point_ids[rows], position_m=correction.points_m[rows], information=correction.point_information[rows])
@@ -41,13 +42,12 @@ def apply_correction(map: Map, correction: Correction) -> Map:
     return replace(map, points=points, lines=lines, planes=planes)
 
 
-def _correct_errors(map: Map, ids: I32, sensitivity: F64, added: F64) -> Map:
-    """Give keyframes a new sensitivity (k, 6, 12) to the calibration, and more covariance (k, 6, 6) in the world. Those inserted since the newest of
-    them still differ from it as they did."""
-    newest, later = int(ids.max()), _later(map, int(ids.max()))
-    T, old = map.keyframes.row("T_world_camera", newest), map.keyframes.row("sensitivity", newest)
+def _correct_errors(map: Map, ids: I32, last: int, later: I32, sensitivity: F64, added: F64) -> Map:
+    """Give keyframes `ids` a new sensitivity (k, 6, 12) to the calibration, and more covariance (k, 6, 6) in the world. The `later` keyframes still
+    differ from the newest of these, `ids[last]`, as they did."""
+    T, old = (map.keyframes.row(name, int(ids[last])) for name in ("T_world_camera", "sensitivity"))
     poses, own = map.keyframes.columns_at(later, "T_world_camera", "sensitivity")
-    to_later, last = adjoint(matmul(invert(poses), T)), np.argmax(ids)
+    to_later = adjoint(matmul(invert(poses), T))
     rows = np.concatenate([ids, later])
     sensitivity = np.concatenate([sensitivity, own + matmul(to_later, sensitivity[last] - old)])
     added = np.concatenate([added, matmul(to_later, added[last], np.swapaxes(to_later, 1, 2))])
@@ -86,9 +86,8 @@ def _move_culled(map: Map, ids: I32, poses: F64) -> Map:
     return replace(map, keyframes=map.keyframes.updated(culled, T_world_camera=matmul(T, T_world[culled])))
 
 
-def _move_later(map: Map, correction: Correction, newest: int, T_corrected: F64) -> Map:
-    """Move what was added after the newest corrected keyframe, in its sub-map, along with it."""
-    later = _later(map, newest)
+def _move_later(map: Map, correction: Correction, newest: int, later: I32, T_corrected: F64) -> Map:
+    """Move what was added after the newest corrected keyframe, in its sub-map, along with it: the `later` keyframes and their landmarks."""
     if not len(later):
         return map
     T = rigid(matmul(T_corrected, invert(map.keyframes.row("T_world_camera", newest))))

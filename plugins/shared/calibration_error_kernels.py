@@ -351,7 +351,8 @@ def keyframes_at(T: F64, poses: F64, twists: F64, sensitivities: F64) -> Keyfram
 @kernel
 def sensitivity_and_evidence(equations: Equations, prior: F64, before: F64) -> tuple[F64, F64, F64]:
     """Return the error of a pose by the calibration (6, 12), `before` being that of its prior of information `prior` (6, 6); and the information
-    (12, 12) and score (12,) on the calibration that the residuals leave beside the pose. What the prior and all keyframes err in common is none."""
+    (12, 12) and score (12,) on the calibration that the residuals leave beside the pose. Errors that the prior and all keyframes have in common leave
+    no residual, and give none."""
     to_pose, carried = inverse_positive(equations.H + prior), matmul(prior, before)
     cross = equations.C - carried
     share = matmul(to_pose, cross)

@@ -12,7 +12,7 @@ from trihedron.pipeline.core.types import Pose
 from trihedron.plugins.shared.distance_scale import contradicting_scale
 from trihedron.plugins.shared.plane_offsets import contradicting_offsets
 from trihedron.plugins.shared.plane_turns import contradicting_turn
-from trihedron.plugins.shared.point_depths import contradicting_depths
+from trihedron.plugins.shared.point_depths import contradicting_point_depths
 
 AVERAGED_FRAMES = 10  # that the disagreement of points is averaged over
 AGREEING_POINTS = 100  # in a frame, that outweigh its planes
@@ -30,7 +30,7 @@ def contradicting_depth(pose: Pose) -> str:
     the image; planes are large and seldom move, and what moves keeps its size. Planes that are off while points, which have depth, too, are where the
     map has them, contradict those as well: the map is inexact there."""
     outweighed = pose.inliers[0] >= AGREEING_POINTS and pose.disagreement <= FEW_DISAGREE
-    tests = contradicting_depths, contradicting_turn, contradicting_scale
+    tests = contradicting_point_depths, contradicting_turn, contradicting_scale
     return next(filter(None, (test(pose) for test in (tests if outweighed else (contradicting_offsets, *tests)))), "")
 
 

@@ -1,7 +1,7 @@
-"""Contradiction between colour and depth: points that the image shows where the map has them are as far away as there.
+"""Contradiction between colour and depth: a point that the image shows where the map has it must be as far away, too.
 
 Where colour is frozen with noise, or late, points agree with each other on where the camera is by their pixels, and depth is that of another view.
-What moves, and what is matched wrongly, lies elsewhere in the image, too, most of it. An imperfect calibration takes some depths beyond their noise
+Most of what moves, or is matched wrongly, lies elsewhere in the image, too. An imperfect calibration takes some depths beyond their noise
 in every frame, and a run shows how many that usually are."""
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def with_depth_disagreement(pose: Pose, previous: Pose, camera: Camera, points: 
     return replace(pose, depth_disagreement=float(late), usual_depth_disagreement=float(usual))
 
 
-def contradicting_depths(pose: Pose) -> str:
+def contradicting_point_depths(pose: Pose) -> str:
     """Return why the depths of points contradict their pixels, empty where no more do than usual."""
     late, usual = 100.0 * pose.depth_disagreement, 100.0 * pose.usual_depth_disagreement
     if late <= MOST * max(usual, 100.0 * LEAST):
