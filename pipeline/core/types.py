@@ -339,12 +339,13 @@ class Pose(Value):
     `scale_difference` is the logarithm of the ratio by which nine of ten distances between matched points are larger than in the map, or below 0
     smaller (0 where neither is so), as a moving average over three frames.
 
-    Five fields are what the pose's error owes to an imperfect calibration (`plugins.shared.calibration_error`, which defines the parameters and their
-    units): `sensitivity` is the derivative of the error by them, `calibration_information` and `calibration_score` the information of the residuals
-    on them so far. `twist` is the camera's velocity (m/s, rad/s) in its own frame, `reference_twist` that of the reference keyframe.
-    `depth_scale_sigma` is the relative standard deviation of the scale of all depths, of which residuals tell nothing."""
+    Six fields are what the pose's error owes to an imperfect calibration (`plugins.shared.calibration_error`, which defines the parameters and their
+    units): `sensitivity` is the derivative of the error by them, `relative_sensitivity` what it has more than that of the reference keyframe,
+    `calibration_information` and `calibration_score` the information of the residuals on them so far. `twist` is the camera's velocity (m/s, rad/s)
+    in its own frame, `reference_twist` that of the reference keyframe. `depth_scale_sigma` is the relative standard deviation of the
+    scale of all depths, of which residuals tell nothing."""
 
-    version: ClassVar[int] = 11
+    version: ClassVar[int] = 11  # a field that is added last, with a default, needs no other: recordings number the fields in their order
 
     T_world_camera: Annotated[F64, Shape(4, 4), Rotations()]
     covariance: Annotated[F64, Shape(6, 6), Finite()]
@@ -380,6 +381,7 @@ class Pose(Value):
     scale_difference: Annotated[float, Finite()] = 0.0
     depth_disagreement: Annotated[float, Within(0.0, 1.0)] = 0.0
     usual_depth_disagreement: Annotated[float, Within(0.0, 1.0)] = 0.0
+    relative_sensitivity: Annotated[F64, Shape(6, CALIBRATION), Finite()] = field(default_factory=lambda: np.zeros((6, CALIBRATION)))
 
     @property
     def local_covariance(self) -> F64:

@@ -27,19 +27,21 @@ class CalibrationErrors:
     covariance: F64  # (k, 6, 6) of xi, by the noise of the directions
 
 
-def errors_by_calibration(poses: F64, rotations: F64, information: F64, sensitivity: F64, since: int) -> CalibrationErrors:
+def errors_by_calibration(poses: F64, rotations: F64, information: F64, sensitivity: F64, turns: F64, since: int) -> CalibrationErrors:
     """Estimate the errors that the calibration gave to keyframes at `poses` (k, 4, 4) since the first of them; zeros where their directions do not
     show them. The estimate is linear in the errors, and so are those that it leaves.
 
-    `rotations` (k, 3) agree best with the axes, with `information` (k, 3, 3), see `ManhattanPrior`; `sensitivity` is (k, 6, 12). Keyframes up to the
-    row `since` may have been corrected before, so that the calibration is estimated separately for them and for the later ones: by least squares with
-    its standard deviations as prior (ridge regression), together with one rotation of all keyframes, the error of the axes. It counts where it
-    explains more than as many parameters would explain of noise (F-test)."""
+    `rotations` (k, 3) agree best with the axes, with `information` (k, 3, 3) and sensitivity `turns` (k, 3, 12), see `ManhattanPrior`; `sensitivity`
+    (k, 6, 12) is that of the poses. Keyframes up to the row `since` may have been corrected before, so that the calibration is estimated separately
+    for them and for the later ones: by least squares with its standard deviations as prior (ridge regression), together with one rotation of all
+    keyframes, the error of the axes. It counts where it explains more than as many parameters would explain of noise (F-test)."""
     R = poses[:, :3, :3]
     first, before = (_carried(poses, sensitivity, np.minimum(np.arange(len(poses)), row)) for row in (0, since))
     errors = np.concatenate([before - first, sensitivity - before], axis=2)  # (k, 6, 24)
+    measured, later = turns - sensitivity[:, 3:], (np.arange(len(poses)) > since)[:, None, None]  # what turns besides the poses
+    observed = errors[:, 3:] + np.concatenate([np.where(later, 0.0, measured), np.where(later, measured, 0.0)], axis=2)
     turned, W = matmul(R, rotations[..., None])[..., 0], matmul(R, information, np.swapaxes(R, 1, 2))
-    X = np.concatenate([np.broadcast_to(np.eye(3), R.shape), matmul(R, errors[:, 3:])], axis=2)
+    X = np.concatenate([np.broadcast_to(np.eye(3), R.shape), matmul(R, observed)], axis=2)
     rows, weighted, y = X.reshape(-1, X.shape[2]), matmul(W, X).reshape(-1, X.shape[2]), turned.ravel()
     H, b, prior = matmul(rows.T, weighted), matmul(weighted.T, y), np.eye(X.shape[2])  # 1 rad is no constraint on the axes
     x = solve(H + prior, b)

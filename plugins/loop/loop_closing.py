@@ -67,7 +67,7 @@ def close_loop(options: LoopOptions, rank: Callable[[Map], Candidates], map: Map
         return correction
     count = len(map.keyframes)
     period = options.straighten << (count // (16 * options.straighten)).bit_length()
-    return None if count % period else align_with_manhattan(options, map, count - 1 - period)
+    return None if count % period else align_with_manhattan(options, map, frame.camera, count - 1 - period)
 
 
 def _first_verified(options: LoopOptions, map: Map, frame: Frame, candidates: Candidates) -> Correction | None:
@@ -84,7 +84,7 @@ def _first_verified(options: LoopOptions, map: Map, frame: Frame, candidates: Ca
         examined |= set(place.window.keyframes.tolist())
         found = _verify(options, map, frame, place) if place.found < options.shared else None
         if found is not None:
-            prior = estimate_manhattan_prior(map) if options.straighten else None
+            prior = estimate_manhattan_prior(map, frame.camera) if options.straighten else None
             return correct_loop(options, map, keyframe, found, prior)
     return None
 

@@ -14,11 +14,12 @@ import numpy as np
 from trihedron.pipeline.core.geometry import invert, pose_matrix
 from trihedron.pipeline.core.lie import exp_se3, exp_so3
 from trihedron.pipeline.core.linalg import inv, inv_symmetric, matmul
-from trihedron.pipeline.core.types import F64, I32, Correction, Map, Table
+from trihedron.pipeline.core.types import F64, I32, Camera, Correction, Map, Table
 from trihedron.plugins.loop.calibration_turn import errors_by_calibration
 from trihedron.plugins.loop.keyframe_correction import correct_keyframes
-from trihedron.plugins.loop.manhattan_prior_kernels import keyframe_rotations
+from trihedron.plugins.loop.manhattan_prior_kernels import Views, keyframe_rotations, line_turns, plane_turns
 from trihedron.plugins.mapping.covisibility_graph import DriftOptions, current_submap, keyframes_of, odometry
+from trihedron.plugins.shared.calibration_error import calibration_scales
 from trihedron.plugins.shared.manhattan_frames_kernels import (
     Walls,
     area_on_axes,
@@ -27,7 +28,7 @@ from trihedron.plugins.shared.manhattan_frames_kernels import (
     perpendicular_pair,
     refine_rotation,
 )
-from trihedron.plugins.shared.pose_graph import Edges, concatenate_edges, solve_pose_graph
+from trihedron.plugins.shared.pose_graph import Edges, concatenate_edges, edge_errors, remaining_errors, solve_pose_graph
 from trihedron.plugins.shared.pose_optimizer import PoseSolution
 
 LINKS = 3  # further keyframes each is connected to, so that a stretch that was observed often stays stiff
@@ -40,20 +41,25 @@ REACH = np.radians(2.0)  # within which a direction belongs to an axis
 GATE = 2.0  # σ at which a robust weight is one half
 EXPLAINED = 0.5  # share of the walls (by views) that must stand on the axes
 NO_MEANS = np.zeros((0, 3))
+NO_EDGES = Edges(np.zeros((0, 2), np.int32), np.zeros((0, 4, 4)), np.zeros((0, 6, 6)))
 
 
 @dataclass(frozen=True)
 class ManhattanPrior:
     """`R_world_manhattan` (3, 3), the keyframes' rows (k,) and, for each, phi of `R_world_camera · Exp(phi)` that agrees best with the axes (k, 3)
-    and its information (k, 3, 3), zero about directions that the keyframe's landmarks do not observe."""
+    and its information (k, 3, 3), zero about directions that the keyframe's landmarks do not observe.
+
+    `sensitivity` (k, 3, 12) is the derivative by the calibration of the rotation of these landmarks, in the keyframe's frame: they turn with the
+    poses that they were placed from, and since the same camera measured them."""
 
     R_world_manhattan: F64
     keyframes: I32
     rotations: F64
     information: F64
+    sensitivity: F64
 
 
-def estimate_manhattan_prior(map: Map) -> ManhattanPrior | None:
+def estimate_manhattan_prior(map: Map, camera: Camera) -> ManhattanPrior | None:
     """Estimate the prior from the directions in the tracked sub-map; None where no two axes have walls, or most walls are on none."""
     rows = keyframes_of(map, current_submap(map))
     planes, at_plane = _middle_observers(map.planes, rows)
@@ -66,9 +72,21 @@ def estimate_manhattan_prior(map: Map) -> ManhattanPrior | None:
     vectors, information = measured_directions(
         coefficients, covariance, WALL_SIGMA, ends.astype(np.float32), end_covariance.astype(np.float32), EDGE_SIGMA, NO_MEANS, NO_MEANS[:, 0]
     )
-    poses = map.keyframes.rows("T_world_camera", rows)
-    observers = np.concatenate([at_plane, at_line])
-    return ManhattanPrior(R, rows, *keyframe_rotations(vectors, information, observers, R, poses, np.cos(REACH), GATE))
+    poses, twists, sensitivity = map.keyframes.columns_at(rows, "T_world_camera", "twist", "sensitivity")
+    samples, seen_by = map.planes.columns_at(planes, "samples_m", "observers")
+    views = Views(
+        poses, twists, sensitivity, camera.intrinsics, camera.width, camera.height, calibration_scales(camera), camera.depth_noise.coefficients
+    )
+    of_planes = plane_turns(coefficients, samples, _numbers(rows, seen_by), at_plane, views)
+    of_lines = line_turns(ends, _numbers(rows, map.lines.rows("observers", lines)), at_line, views)
+    turns, observers = np.concatenate([of_planes, of_lines]), np.concatenate([at_plane, at_line])
+    return ManhattanPrior(R, rows, *keyframe_rotations(vectors, information, turns, observers, R, poses, np.cos(REACH), GATE))
+
+
+def _numbers(rows: I32, keyframes: I32) -> I32:
+    """Return where keyframes (any shape) are in `rows` (sorted), -1 for those that are not."""
+    at = np.minimum(np.searchsorted(rows, keyframes), len(rows) - 1)
+    return np.where(rows[at] == keyframes, at, -1).astype(np.int32)
 
 
 def _middle_observers(landmarks: Table, keyframes: I32) -> tuple[I32, I32]:
@@ -108,40 +126,41 @@ class StraighteningOptions(DriftOptions, Protocol):
 
 
 def correct_loop(options: DriftOptions, map: Map, keyframe: int, found: PoseSolution, prior: ManhattanPrior | None) -> Correction:
-    """Correct the tracked sub-map by a verified loop: the newest keyframe's pose, with its covariance, relative to `keyframe`."""
+    """Correct the tracked sub-map by a verified loop: the newest keyframe's pose, with its covariance, relative to `keyframe`. The sensitivities
+    become those of the corrected poses; their covariance stays, although most drift is undone."""
     rows = keyframes_of(map, current_submap(map))
-    before = map.keyframes.rows("T_world_camera", rows)
+    before, sensitivity = map.keyframes.columns_at(rows, "T_world_camera", "sensitivity")
     place, newest = np.searchsorted(rows, [keyframe, len(map.keyframes) - 1])
     information = np.asarray(inv(found.covariance), np.float64)[None]
     closing = Edges(np.array([[place, newest]], np.int32), matmul(invert(before[place]), found.T_world_camera)[None], information)
-    edges = concatenate_edges(odometry_edges(options, map, rows), closing)
-    return correct_keyframes(map, rows, before, _solve_with_prior(before, edges, prior))
+    solved = _solve_with_prior(before, sensitivity, odometry_edges(options, map, rows), closing, prior)
+    correction = correct_keyframes(map, rows, before, solved.poses)
+    return replace(correction, sensitivity=solved.sensitivity, added_covariance=np.zeros((len(rows), 6, 6)))
 
 
-def align_with_manhattan(options: StraighteningOptions, map: Map, since: int) -> Correction | None:
+def align_with_manhattan(options: StraighteningOptions, map: Map, camera: Camera, since: int) -> Correction | None:
     """Rotate every keyframe back to the Manhattan frame of the map; None without one, or where the newest would hardly rotate.
 
     What the calibration explains is undone first (`calibration_turn`); keyframes up to the row `since` have been aligned before. The rest is drift,
     and is left alone where some keyframe would turn by more than is plausible for drift."""
-    prior = estimate_manhattan_prior(map)
+    prior = estimate_manhattan_prior(map, camera)
     if prior is None:
         return None
     before, sensitivity = map.keyframes.columns_at(prior.keyframes, "T_world_camera", "sensitivity")
     last = max(int(np.searchsorted(prior.keyframes, since, "right")) - 1, 0)
-    errors = errors_by_calibration(before, prior.rotations, prior.information, sensitivity, last)
+    errors = errors_by_calibration(before, prior.rotations, prior.information, sensitivity, prior.sensitivity, last)
     moved = matmul(before, np.array([exp_se3(x) for x in errors.xi]))
     at_moved = replace(map, keyframes=map.keyframes.updated(prior.keyframes, T_world_camera=moved))
-    rest = replace(prior, rotations=prior.rotations - errors.xi[:, 3:])
-    after = _solve_with_prior(moved, odometry_edges(options, at_moved, prior.keyframes), rest)
+    turned = prior.sensitivity + errors.sensitivity[:, 3:] - sensitivity[:, 3:]
+    rest = replace(prior, rotations=prior.rotations - errors.xi[:, 3:], sensitivity=turned)
+    solved = _solve_with_prior(moved, errors.sensitivity, odometry_edges(options, at_moved, prior.keyframes), NO_EDGES, rest)
     path_m = np.linalg.norm(np.diff(moved[:, :3, 3], axis=0), axis=1).sum()
-    if _angles(moved, after).max() > PLAUSIBLE * np.radians(options.rotation_drift_deg) * np.sqrt(path_m):
-        after = moved
-    if _angles(before, after)[-1] < np.radians(options.straighten_deg):
+    if _angles(moved, solved.poses).max() > PLAUSIBLE * np.radians(options.rotation_drift_deg) * np.sqrt(path_m):
+        solved = Solved(moved, errors.sensitivity)
+    if _angles(before, solved.poses)[-1] < np.radians(options.straighten_deg):
         return None
-    correction = correct_keyframes(map, prior.keyframes, before, after)
-    if not errors.xi.any():
-        return correction
-    return replace(correction, sensitivity=errors.sensitivity, added_covariance=errors.covariance)
+    correction = correct_keyframes(map, prior.keyframes, before, solved.poses)
+    return replace(correction, sensitivity=solved.sensitivity, added_covariance=errors.covariance)
 
 
 def _angles(before: F64, after: F64) -> F64:
@@ -150,17 +169,38 @@ def _angles(before: F64, after: F64) -> F64:
     return np.asarray(np.arccos(np.clip(cosine, -1.0, 1.0)))
 
 
-def _solve_with_prior(before: F64, edges: Edges, prior: ManhattanPrior | None) -> F64:
-    """Poses of the keyframes by a pose graph, in which the Manhattan frame is one more node, whose direction every keyframe measures."""
-    if prior is None:
-        return solve_pose_graph(before, edges)
-    count, axes = len(before), pose_matrix(prior.R_world_manhattan, np.zeros(3))
+@dataclass(frozen=True)
+class Solved:
+    """Poses (k, 4, 4) of keyframes by a pose graph, and their sensitivity (k, 6, 12) to the calibration."""
+
+    poses: F64
+    sensitivity: F64
+
+
+def _solve_with_prior(before: F64, sensitivity: F64, odometry: Edges, closing: Edges, prior: ManhattanPrior | None) -> Solved:
+    """Solve for the poses of keyframes by a pose graph, in which the Manhattan frame is one more node, whose direction every keyframe measures.
+    Odometry errs by the calibration as the poses `before` do, by their `sensitivity`; a closed loop does not, and directions by that of the prior."""
+    count, edges = len(before), concatenate_edges(odometry, closing)
+    differences = np.concatenate([np.zeros((len(odometry.pairs), *sensitivity.shape[1:])), edge_errors(before, closing, sensitivity)])
+    if prior is not None:
+        axes = pose_matrix(prior.R_world_manhattan, np.zeros(3))
+        before, sensitivity = np.concatenate([before, axes[None]]), np.concatenate([sensitivity, np.zeros_like(sensitivity[:1])])
+        edges = concatenate_edges(edges, _directions(before, prior))
+        differences = np.concatenate([differences, np.pad(prior.sensitivity, ((0, 0), (3, 0), (0, 0)))])
+    solved = Solved(solve_pose_graph(before, edges), remaining_errors(before, edges, sensitivity, differences))
+    return Solved(solved.poses[:count], solved.sensitivity[:count])
+
+
+def _directions(nodes: F64, prior: ManhattanPrior) -> Edges:
+    """Edges from the Manhattan frame, the last of the nodes (k + 1, 4, 4), to each keyframe, whose direction in it the prior measures."""
+    before, axes = nodes[:-1], nodes[-1]
+    count = len(before)
     measured = matmul(invert(axes), before)
     measured[:, :3, :3] = matmul(measured[:, :3, :3], np.array([exp_so3(phi) for phi in prior.rotations]))
     information = np.zeros((count, 6, 6))
     information[:, :3, :3], information[:, 3:, 3:] = UNKNOWN * np.eye(3), prior.information
     pairs = np.stack([np.full(count, count), np.arange(count)], axis=1).astype(np.int32)
-    return solve_pose_graph(np.concatenate([before, axes[None]]), concatenate_edges(edges, Edges(pairs, measured, information)))[:count]
+    return Edges(pairs, measured, information)
 
 
 def odometry_edges(options: DriftOptions, map: Map, rows: I32) -> Edges:

@@ -1,7 +1,8 @@
 """Poses relative to their reference keyframes.
 
-A correction of the map is applied at the end of a frame, after its pose was estimated. The pose is stored relative to its reference keyframe, so
-that poses, and the world–Manhattan rotations estimated with them, follow a corrected keyframe without a jump.
+A correction of the map is applied at the end of a frame, after its pose was estimated. The pose is stored relative to its reference keyframe, and so
+is its sensitivity to the calibration, so that poses, and the world–Manhattan rotations estimated with them, follow a corrected keyframe without a
+jump.
 """
 
 from __future__ import annotations
@@ -11,9 +12,11 @@ from dataclasses import replace
 import numpy as np
 
 from trihedron.pipeline.core.geometry import invert, rigid
+from trihedron.pipeline.core.lie import adjoint
 from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import F64, Map, Pose, Rotation
 from trihedron.plugins.mapping.covisibility_graph import keyframes_of
+from trihedron.plugins.shared.calibration_error import calibration_covariance
 
 UNMOVED = 1e-12  # rad and m: rounding; a keyframe that moved by less leaves the pose unchanged
 
@@ -26,7 +29,22 @@ def transform_to_map(pose: Pose, map: Map | None) -> Pose:
     relative = matmul(invert(T_world_keyframe), pose.T_world_camera)
     if np.abs(relative - pose.T_reference_camera).max() < UNMOVED:
         return pose
-    return replace(pose, T_world_camera=rigid(matmul(T_world_keyframe, pose.T_reference_camera)))
+    sensitivity = _reference_sensitivity(pose, map) + pose.relative_sensitivity
+    moved = replace(pose, T_world_camera=rigid(matmul(T_world_keyframe, pose.T_reference_camera)), sensitivity=sensitivity)
+    change = calibration_covariance(moved) - calibration_covariance(pose)
+    return replace(moved, covariance=pose.covariance + change, map_covariance=pose.map_covariance + change)
+
+
+def with_relative_sensitivity(pose: Pose, map: Map) -> Pose:
+    """Give a pose what its sensitivity to the calibration has more than that of its reference keyframe; zero without one."""
+    if not 0 <= pose.reference < len(map.keyframes):
+        return pose
+    return replace(pose, relative_sensitivity=pose.sensitivity - _reference_sensitivity(pose, map))
+
+
+def _reference_sensitivity(pose: Pose, map: Map) -> F64:
+    """The sensitivity (6, 12) to the calibration of a camera that moves rigidly with the pose's reference keyframe."""
+    return np.asarray(matmul(adjoint(invert(pose.T_reference_camera)), map.keyframes.row("sensitivity", pose.reference)))
 
 
 def transform_rotation_to_map(previous: Rotation, pose: Pose | None, map: Map | None) -> tuple[Rotation, Pose | None]:

@@ -5,7 +5,8 @@ for the first pose. A frame like its keyframes repeats their errors, so B grows 
 error of calibration is the same in all of them, and grows with the way from the origin where a random walk grows with its root. The residuals tell
 of θ by the pattern that it leaves in them. The covariance `B E[θθᵀ] Bᵀ` is added to that of the pose (a Schmidt–Kalman filter); no pose is corrected.
 
-A landmark is taken to be where the keyframes that observed it saw it on average. Lines, and relations of planes, tell nothing of θ here."""
+A landmark is taken to be where the keyframes that observed it saw it on average, weighted by the information that each has of it. Lines, and
+relations of planes, tell nothing of θ here."""
 
 from __future__ import annotations
 
@@ -14,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 
 from trihedron.pipeline.core.kernel import constant
-from trihedron.pipeline.core.types import F64, I32, Map, Pose
+from trihedron.pipeline.core.types import F64, I32, Camera, Map, Pose
 from trihedron.plugins.pose.map_alignment import MapAlignment
 from trihedron.plugins.shared.calibration_error import CALIBRATION_NAMES, calibration_scales
 from trihedron.plugins.shared.calibration_error_kernels import (
@@ -75,15 +76,17 @@ def plane_sigmas_m(pose: Pose, problem: MapAlignment) -> F64:
         constant(pose.T_world_camera, np.float64), camera.intrinsics, camera.width, camera.height, calibration_scales(camera), pose.twist,
         pose.sensitivity, calibration_moment(pose.calibration_information, pose.calibration_score),
         map.planes.rows("coefficients", planes[:, 1]), constant(samples_of(problem.planes, planes), np.float32), observed.planes,
-        keyframes_seen(pose, map, rows, map.keyframes.rows("T_world_camera", rows)),
+        keyframes_seen(pose, map, camera, rows, map.keyframes.rows("T_world_camera", rows)),
     )  # fmt: skip
 
 
-def keyframes_seen(pose: Pose, map: Map, rows: I32, poses: F64) -> Keyframes:
+def keyframes_seen(pose: Pose, map: Map, camera: Camera, rows: I32, poses: F64) -> Keyframes:
     """Return the keyframes in rows (k,) of the map, with poses (k, 4, 4), their velocities, and their errors by the calibration for the camera."""
     sensitivities, twists = map.keyframes.columns_at(rows, "sensitivity", "twist")
     twists[rows == pose.reference] = pose.reference_twist
-    return keyframes_at(constant(pose.T_world_camera, np.float64), poses, constant(twists, np.float64), sensitivities)
+    return keyframes_at(
+        constant(pose.T_world_camera, np.float64), poses, constant(twists, np.float64), sensitivities, camera.depth_noise.coefficients
+    )
 
 
 def carried_sensitivity(pose: Pose, previous: Pose) -> F64:

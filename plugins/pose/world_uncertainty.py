@@ -17,6 +17,7 @@ from trihedron.pipeline.core.kernel import constant
 from trihedron.pipeline.core.lie import adjoint
 from trihedron.pipeline.core.linalg import eigvalsh, matmul
 from trihedron.pipeline.core.types import F64, I32, Map, Pose
+from trihedron.plugins.mapping.reference_keyframe import with_relative_sensitivity
 from trihedron.plugins.pose.calibration_uncertainty import carried_calibration, keyframes_seen, reference_velocity, with_calibration
 from trihedron.plugins.pose.map_alignment import MapAlignment
 from trihedron.plugins.pose.world_uncertainty_kernels import scatter_and_drift
@@ -95,10 +96,11 @@ def in_world(pose: Pose, previous: Pose, solution: PoseSolution, problem: MapAli
         noise_scale += (min(scale, SCALE_OUTLIER * noise_scale) - noise_scale) / SCALE_FRAMES
     moving = replace(pose, noise_scale=noise_scale, reference_twist=reference_velocity(pose, previous, problem.map))
     if pose.repeats or pose.jumps:
-        carried = _with_world_covariance(carried_calibration(moving, previous), by_drift)
-        return _with_unseen_motion(carried, previous) if pose.repeats else carried
-    keyframes = keyframes_seen(moving, problem.map, rows, poses)
-    return _with_world_covariance(with_calibration(moving, previous, problem, flags, keyframes, observed), by_drift)
+        moving = carried_calibration(moving, previous)
+    else:
+        moving = with_calibration(moving, previous, problem, flags, keyframes_seen(moving, problem.map, problem.camera, rows, poses), observed)
+    in_world = _with_world_covariance(with_relative_sensitivity(moving, problem.map), by_drift)
+    return _with_unseen_motion(in_world, previous) if pose.repeats else in_world
 
 
 def _with_unseen_motion(pose: Pose, previous: Pose) -> Pose:

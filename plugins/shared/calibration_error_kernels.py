@@ -1,7 +1,8 @@
 """Kernels of `calibration_error.py`: what residuals tell of the calibration, and its second moments.
 
 A measurement errs by `M θ`: `keypoint_errors` in the image and in inverse depth, `plane_point_error` along a plane's normal. A landmark was placed by
-the same camera from the keyframes that observed it, and errs with their mean. A residual shows the difference, and the keyframes' own errors."""
+the same camera from the keyframes that observed it, and errs with their mean, weighted by the information that each has of it. A residual shows the
+difference, and the keyframes' own errors."""
 # mypy: disable-error-code="arg-type, assignment, index, return-value"
 
 from __future__ import annotations
@@ -11,8 +12,9 @@ from typing import NamedTuple
 import numpy as np
 
 from trihedron.pipeline.core.kernel import kernel
-from trihedron.pipeline.core.linalg_kernels import add_matrix, copy_matrix, inverse_positive, matmul, matvec, split_pose, tangent_columns
+from trihedron.pipeline.core.linalg_kernels import copy_matrix, inverse_positive, invert_symmetric, matmul, matvec, split_pose, tangent_columns
 from trihedron.pipeline.core.types import CALIBRATION, F32, F64, I32, U8
+from trihedron.plugins.shared.depth_image_kernels import sigma_z
 from trihedron.plugins.shared.lie_kernels import adjoint_between
 from trihedron.plugins.shared.pose_optimizer_kernels import Flags
 from trihedron.plugins.shared.residuals_kernels import (
@@ -35,13 +37,14 @@ LEAST_SAMPLES = 4  # of a plane in both views, from which on it informs on the c
 
 
 class Keyframes(NamedTuple):
-    """The m keyframes that observed landmarks: rotations and positions of `T_world_keyframe`, velocities, and errors by the calibration as those of
-    xi of the camera."""
+    """The m keyframes that observed landmarks: rotations and positions of `T_world_keyframe`, velocities, errors by the calibration as those of
+    xi of the camera, and the noise of their depth (`DepthNoise.coefficients`)."""
 
     R: F64  # (m, 3, 3)
     t: F64  # (m, 3)
     twists: F64  # (m, 6)
     errors: F64  # (m, 6, 12)
+    noise: tuple[float, float, float, float]
 
 
 class Observers(NamedTuple):
@@ -124,16 +127,6 @@ def _add(J: F64, W: F64, K: F64, r: F64, WJ: F64, WK: F64, total: Equations) -> 
 
 
 @kernel(forceinline=True)
-def _scale_and_subtract(scales: F64, J: F64, A: F64, K: F64) -> None:
-    """Express K (3, 12) in units of `scales`; and subtract J A, since a landmark moves with the keyframes that observed it, whose mean error by the
-    calibration is A (6, 12) as that of the camera."""
-    for i in range(3):
-        for k in range(CALIBRATION):
-            moved = J[i, 0] * A[0, k] + J[i, 1] * A[1, k] + J[i, 2] * A[2, k] + J[i, 3] * A[3, k] + J[i, 4] * A[4, k] + J[i, 5] * A[5, k]
-            K[i, k] = K[i, k] * scales[k] - moved
-
-
-@kernel(forceinline=True)
 def to_keyframe(R: F64, t: F64, plane: F64, out: F64) -> None:
     """Move a plane (4,) of the world into the frame of a pose R, t."""
     out[3] = plane[3]
@@ -151,28 +144,39 @@ def to_observers(keyframes: Keyframes, observers: I32, plane: F64, out: F64) -> 
 
 
 @kernel(forceinline=True)
-def _add_point_error(q: F64, of_plane: F64, Q: F64, twist: F64, camera: F64, width: int, height: int, D: F64, E: F64, K: F64) -> None:
-    """Add `D Q dq/dθ` to K (3, 12): the error of a landmark as a keyframe saw it, q (3,) in its frame, with Q from that frame to the camera's and
-    D = dr/dp; `of_plane` (4,) is the surface there. E (3, 12) is overwritten."""
-    keypoint_errors(q, of_plane, twist, camera, width, height, E)
-    for i in range(3):  # D Q dq/d(u, v, 1/z)
-        x, y, z = 0.0, 0.0, 0.0
-        for j in range(3):
-            x, y, z = x + D[i, j] * Q[j, 0], y + D[i, j] * Q[j, 1], z + D[i, j] * Q[j, 2]
-        u, v, w = x * q[2] / camera[0], y * q[2] / camera[1], -q[2] * (x * q[0] + y * q[1] + z * q[2])
+def _add_view(
+    q: F64, surface: F64, Q: F64, twist: F64, camera: F64, width: int, height: int, scales: F64, by_pixel: float, by_depth: float, moved: F64,
+    E: F64, N: F64, V: F64,
+) -> None:  # fmt: skip
+    """Add the information that a keyframe's view of a landmark gives of its position in the camera's frame to N (3, 3), and its product with the
+    error of that position by each parameter to V (3, 12).
+
+    q (3,) is the landmark and `surface` (4,) its surface, both in the keyframe's frame, which Q turns to the camera's; pixels have the information
+    `by_pixel`, and depth `by_depth`; the error of the keyframe's pose has `moved` (3, 12) the landmark. E (3, 12) is overwritten."""
+    keypoint_errors(q, surface, twist, camera, width, height, E)
+    iz, g = 1.0 / q[2], np.empty(3)
+    for r in range(3):  # u, v, 1/z
+        weight = by_pixel if r < 2 else by_depth / (iz * iz * iz * iz)
+        for i in range(3):
+            g[i] = camera[r] * iz * (Q[i, r] - q[r] * iz * Q[i, 2]) if r < 2 else -iz * iz * Q[i, 2]
+        for i in range(3):
+            for j in range(3):
+                N[i, j] += weight * g[i] * g[j]
         for k in range(CALIBRATION):
-            K[i, k] += u * E[0, k] + v * E[1, k] + w * E[2, k]
+            error = weight * (E[r, k] * scales[k] + g[0] * moved[0, k] + g[1] * moved[1, k] + g[2] * moved[2, k])
+            for i in range(3):
+                V[i, k] += g[i] * error
 
 
 @kernel(forceinline=True)
 def _point_calibration_jacobian(
     R: F64, world: F64, p: F64, surface: F64, observers: I32, keyframes: Keyframes, twist: F64, camera: F64, width: int, height: int,
-    D: F64, K: F64, A: F64,
+    scales: F64, sigma_px: float, D: F64, K: F64,
 ) -> bool:  # fmt: skip
-    """Fill K (3, 12): the mean error of a landmark over its observers, less that of its measurement at p (3,) in the camera's frame; and A (6, 12),
-    the observers' mean error. Returns False where no keyframe is known to have seen it."""
-    q, then, Q, E = np.empty(3), np.empty(4), np.empty((3, 3)), np.empty((3, CALIBRATION))
-    K[:], A[:], seen = 0.0, 0.0, 0
+    """Fill K (3, 12), by parameters in units of `scales`: the error of a landmark that its observers placed, by pixels of `sigma_px` and their depth,
+    less that of its measurement at p (3,) in the camera's frame. Returns False where no keyframe is known to have seen it."""
+    q, then, Q, E, moved = np.empty(3), np.empty(4), np.empty((3, 3)), np.empty((3, CALIBRATION)), np.empty((3, CALIBRATION))
+    N, V, M, seen = np.zeros((3, 3)), np.zeros((3, CALIBRATION)), np.empty((3, 3)), False
     for k in observers:
         if k < 0:
             continue
@@ -183,17 +187,24 @@ def _point_calibration_jacobian(
             for b in range(3):
                 Q[a, b] = R[0, a] * keyframes.R[k, 0, b] + R[1, a] * keyframes.R[k, 1, b] + R[2, a] * keyframes.R[k, 2, b]
         _plane_then(surface, Q, p, q, then)
-        _add_point_error(q, then, Q, keyframes.twists[k], camera, width, height, D, E, K)
-        add_matrix(keyframes.errors[k], A)
-        seen += 1
-    if seen == 0:
+        for c in range(CALIBRATION):
+            x, y, z = keyframes.errors[k, 3, c], keyframes.errors[k, 4, c], keyframes.errors[k, 5, c]
+            moved[0, c] = keyframes.errors[k, 0, c] + y * p[2] - z * p[1]
+            moved[1, c] = keyframes.errors[k, 1, c] + z * p[0] - x * p[2]
+            moved[2, c] = keyframes.errors[k, 2, c] + x * p[1] - y * p[0]
+        by_pixel, by_depth = 1.0 / sigma_px**2, 1.0 / sigma_z(q[2], keyframes.noise) ** 2
+        _add_view(q, then, Q, keyframes.twists[k], camera, width, height, scales, by_pixel, by_depth, moved, E, N, V)
+        seen = True
+    if not seen:
         return False
+    invert_symmetric(N, M)
     keypoint_errors(p, surface, twist, camera, width, height, E)
     rows = 3 if D[2, 2] != 0.0 else 2
     for i in range(3):
+        for b in range(3):
+            Q[i, b] = D[i, 0] * M[0, b] + D[i, 1] * M[1, b] + D[i, 2] * M[2, b]
         for k in range(CALIBRATION):
-            K[i, k] = K[i, k] / seen - (E[i, k] if i < rows else 0.0)
-    A /= seen
+            K[i, k] = Q[i, 0] * V[0, k] + Q[i, 1] * V[1, k] + Q[i, 2] * V[2, k] - (E[i, k] * scales[k] if i < rows else 0.0)
     return True
 
 
@@ -216,7 +227,7 @@ def _add_points(
 ) -> None:  # fmt: skip
     """Add the inliers among the points; `surfaces` (n, 4) are the planes that they lie on, in the camera frame (NaN: none)."""
     p, r, D, J = np.empty(3), np.empty(3), np.zeros((3, 3)), np.empty((3, 6))
-    K, A, WJ, WK = np.empty((3, CALIBRATION)), np.empty((6, CALIBRATION)), np.empty((3, 6)), np.empty((3, CALIBRATION))
+    K, WJ, WK = np.empty((3, CALIBRATION)), np.empty((3, 6)), np.empty((3, CALIBRATION))
     for i in range(len(flags)):
         if not flags[i]:
             continue
@@ -224,9 +235,10 @@ def _add_points(
         to_camera(R, t, world, p)
         if not point_residual(p, points.pixels[i], points.depth_m[i], camera, r, D):
             continue
-        if _point_calibration_jacobian(R, world, p, surfaces[i], observers[i], keyframes, twist, camera, width, height, D, K, A):
+        if _point_calibration_jacobian(
+            R, world, p, surfaces[i], observers[i], keyframes, twist, camera, width, height, scales, points.sigma_px[i], D, K
+        ):
             pose_jacobian(D, 3, p, J)
-            _scale_and_subtract(scales, J, A, K)
             _add(J, W[i], K, r, WJ, WK, total)
 
 
@@ -239,51 +251,75 @@ def in_view(p: F64, camera: F64, width: int, height: int) -> bool:
     return bool(0.0 <= u < width and 0.0 <= v < height)
 
 
+@kernel(forceinline=True)
+def distance_jacobian(plane: F64, p: F64, J: F64) -> None:
+    """Fill J (6,): derivative of the distance of a point p (3,) from a plane (4,) by the pose that it is seen from, both in its frame."""
+    J[0], J[1], J[2] = plane[0], plane[1], plane[2]
+    J[3], J[4], J[5] = p[1] * plane[2] - p[2] * plane[1], p[2] * plane[0] - p[0] * plane[2], p[0] * plane[1] - p[1] * plane[0]
+
+
+@kernel(forceinline=True)
+def placed_distance_error(
+    point: F64, J: F64, observers: I32, keyframes: Keyframes, then: F64, camera: F64, width: int, height: int, scales: F64, q: F64, E: F64, out: F64
+) -> bool:
+    """Fill `out` (12,), by parameters in units of `scales`: the mean error of the distance of a point (3,) of the world from the plane that
+    `observers` placed, weighted by the noise of their depth. `then` (o, 4) is the plane in their frames, and J (6,) `distance_jacobian` in the
+    camera's; q (3,) and E (12,) are overwritten. Returns False where none of them had the point in its image."""
+    out[:], weights = 0.0, 0.0
+    for o in range(len(observers)):
+        k = observers[o]
+        if k < 0:
+            continue
+        to_camera(keyframes.R[k], keyframes.t[k], point, q)
+        if not in_view(q, camera, width, height):
+            continue
+        plane_point_error(q, then[o], keyframes.twists[k], camera, width, height, E)
+        weight = 1.0 / sigma_z(q[2], keyframes.noise) ** 2
+        for c in range(CALIBRATION):
+            error = E[c] * scales[c]
+            for a in range(6):
+                error += J[a] * keyframes.errors[k, a, c]
+            out[c] += weight * error
+        weights += weight
+    if weights == 0.0:
+        return False
+    for c in range(CALIBRATION):
+        out[c] /= weights
+    return True
+
+
 @kernel
 def _plane_calibration_jacobian(
     R: F64, t: F64, plane: F64, samples: F32, observers: I32, keyframes: Keyframes, twist: F64, camera: F64, width: int, height: int,
-    B: F64, K: F64, A: F64,
+    scales: F64, B: F64, K: F64,
 ) -> bool:  # fmt: skip
-    """Fill K (3, 12): what the calibration does to a plane (4,), fitted to what it does to those of its samples (n, 3) that are in view of the camera
-    and of an observer; and A (6, 12), the observers' mean error. Returns False for too few of them. B (3, 2) are the tangents of its residual."""
-    p, q, then = np.empty(3), np.empty(3), np.empty((len(observers), 4))
-    now, E, F, mean, row = np.empty(4), np.empty(CALIBRATION), np.empty(CALIBRATION), np.empty(CALIBRATION), np.ones(3)
+    """Fill K (3, 12), by parameters in units of `scales`: what the calibration does to a plane (4,) as measured, less what it did to the map's, which
+    its observers placed, fitted to what it does to those of its samples (n, 3) that are in view of the camera and of an observer. Returns False for
+    too few of them. B (3, 2) are the tangents of its residual."""
+    p, q, then, J = np.empty(3), np.empty(3), np.empty((len(observers), 4)), np.empty(6)
+    now, E, mean, row = np.empty(4), np.empty(CALIBRATION), np.empty(CALIBRATION), np.ones(3)
     to_keyframe(R, t, plane, now)
     to_observers(keyframes, observers, plane, then)
-    N, X, seen, total = np.zeros((3, 3)), np.zeros((3, CALIBRATION)), 0, 0
-    A[:] = 0.0
+    N, X, seen = np.zeros((3, 3)), np.zeros((3, CALIBRATION)), 0
     for j in range(len(samples)):
         point = samples[j].astype(np.float64)
         to_camera(R, t, point, p)
         if not in_view(p, camera, width, height):
             continue
-        mean[:], count = 0.0, 0
-        for o in range(len(observers)):
-            k = observers[o]
-            if k < 0:
-                continue
-            to_camera(keyframes.R[k], keyframes.t[k], point, q)
-            if not in_view(q, camera, width, height):
-                continue
-            plane_point_error(q, then[o], keyframes.twists[k], camera, width, height, E)
-            for c in range(CALIBRATION):
-                mean[c] += E[c]
-            add_matrix(keyframes.errors[k], A)
-            count += 1
-        if count == 0:
+        distance_jacobian(now, p, J)
+        if not placed_distance_error(point, J, observers, keyframes, then, camera, width, height, scales, q, E, mean):
             continue
-        seen, total = seen + 1, total + count
-        plane_point_error(p, now, twist, camera, width, height, F)
+        seen += 1
+        plane_point_error(p, now, twist, camera, width, height, E)
         row[0], row[1] = B[0, 0] * p[0] + B[1, 0] * p[1] + B[2, 0] * p[2], B[0, 1] * p[0] + B[1, 1] * p[1] + B[2, 1] * p[2]
         for a in range(3):
             for b in range(3):
                 N[a, b] += row[a] * row[b]
             for c in range(CALIBRATION):
-                X[a, c] += row[a] * (F[c] - mean[c] / count)
+                X[a, c] += row[a] * (E[c] * scales[c] - mean[c])
     if seen < LEAST_SAMPLES:
         return False
     copy_matrix(matmul(inverse_positive(N), X), K)
-    A /= total
     return True
 
 
@@ -294,15 +330,14 @@ def _add_planes(
 ) -> None:  # fmt: skip
     """Add the inliers among the identical planes, the first of the planes; `samples` (p, n, 3) are points on them, world."""
     r, B, J = np.empty(3), np.empty((3, 2)), np.empty((3, 6))
-    K, A, WJ, WK = np.empty((3, CALIBRATION)), np.empty((6, CALIBRATION)), np.empty((3, 6)), np.empty((3, CALIBRATION))
+    K, WJ, WK = np.empty((3, CALIBRATION)), np.empty((3, 6)), np.empty((3, CALIBRATION))
     for i in range(len(samples)):
         if not flags[i]:
             continue
         plane = planes.coefficients[i]
         tangent_columns(planes.observed[i], B)
         plane_residual(np.int32(SAME), R, t, plane, planes.observed[i], B, r, J)
-        if _plane_calibration_jacobian(R, t, plane, samples[i], observers[i], keyframes, twist, camera, width, height, B, K, A):
-            _scale_and_subtract(scales, J, A, K)
+        if _plane_calibration_jacobian(R, t, plane, samples[i], observers[i], keyframes, twist, camera, width, height, scales, B, K):
             _add(J, W[i], K, r, WJ, WK, total)
 
 
@@ -336,8 +371,9 @@ def moved_sensitivity(T: F64, previous: F64, sensitivity: F64) -> F64:
 
 
 @kernel
-def keyframes_at(T: F64, poses: F64, twists: F64, sensitivities: F64) -> Keyframes:
-    """Return keyframes with poses (m, 4, 4), velocities (m, 6) and errors by the calibration (m, 6, 12) of their own, for a camera at T (4, 4)."""
+def keyframes_at(T: F64, poses: F64, twists: F64, sensitivities: F64, noise: tuple[float, float, float, float]) -> Keyframes:
+    """Return keyframes with poses (m, 4, 4), velocities (m, 6) and errors by the calibration (m, 6, 12) of their own, and a noise of depth, for a
+    camera at T (4, 4)."""
     R, t, errors = np.empty((len(poses), 3, 3)), np.empty((len(poses), 3)), np.empty(sensitivities.shape)
     for k in range(len(poses)):
         for i in range(3):
@@ -345,7 +381,7 @@ def keyframes_at(T: F64, poses: F64, twists: F64, sensitivities: F64) -> Keyfram
             for j in range(3):
                 R[k, i, j] = poses[k, i, j]
         copy_matrix(moved_sensitivity(T, poses[k], sensitivities[k]), errors[k])
-    return Keyframes(R, t, twists, errors)
+    return Keyframes(R, t, twists, errors, noise)
 
 
 @kernel

@@ -46,7 +46,7 @@ def solve_pose_graph(poses: F64, edges: Edges) -> F64:
     cost, H, g = _normal_equations(current, edges)
     for _ in range(ITERATIONS):
         scale = diags(H.diagonal())
-        step = _solve(H + damping * scale, -g).reshape(-1, 6)
+        step = _solve(H + damping * scale, -g[:, None]).reshape(-1, 6)
         step[0] = 0.0  # fixed but for rounding
         tried = _retract(current, step)
         new_cost, new_H, new_g = _normal_equations(tried, edges)
@@ -62,13 +62,13 @@ def solve_pose_graph(poses: F64, edges: Edges) -> F64:
 
 
 def _solve(H: bsr_matrix, g: F64) -> F64:
-    """Solve `H x = g` for a symmetric positive definite H (6n, 6n), with nodes in the order of reverse Cuthill and McKee, which keeps the factor
-    narrow."""
+    """Solve `H x = g` (6n, m) for a symmetric positive definite H (6n, 6n), with nodes in the order of reverse Cuthill and McKee, which keeps the
+    factor narrow."""
     from scipy.sparse.csgraph import reverse_cuthill_mckee
 
     order = reverse_cuthill_mckee(H.tocsr(), symmetric_mode=True)
     permuted = H.tocsr()[order][:, order]
-    x = np.empty(len(g))
+    x = np.empty(g.shape)
     x[order] = solve_envelope(permuted.indptr, permuted.indices, permuted.data, g[order])
     return x
 
@@ -83,6 +83,36 @@ def _retract(poses: F64, steps: F64) -> F64:
 
 def _normal_equations(poses: F64, edges: Edges) -> tuple[float, bsr_matrix, F64]:
     """Cost, (6n, 6n) approximate Hessian and (6n,) gradient of half the squared error."""
+    (a, b), n = edges.pairs.T, len(poses)
+    error, J_a, J_b = _linearised(poses, edges)
+    W_a, W_b = _weighted(J_a, edges), _weighted(J_b, edges)
+    blocks = np.concatenate([matmul(W_a, J_a), matmul(W_a, J_b), matmul(W_b, J_a), matmul(W_b, J_b), FIXED[None]])
+    rows, columns = np.concatenate([a, a, b, b, [0]]), np.concatenate([a, b, a, b, [0]])
+    g = _gradient(n, edges.pairs, W_a, W_b, error[..., None])
+    cost = float(np.einsum("ei,eij,ej->", error, edges.information, error))
+    return cost, _assemble(blocks, rows, columns, n), g.ravel()
+
+
+def edge_errors(poses: F64, edges: Edges, errors: F64) -> F64:
+    """Return the errors (e, 6, m) of the motions that edges measure, where poses (n, 4, 4) have small errors (n, 6, m)."""
+    a, b = edges.pairs.T
+    _, J_a, J_b = _linearised(poses, edges)
+    return np.asarray(matmul(J_a, errors[a]) + matmul(J_b, errors[b]))
+
+
+def remaining_errors(poses: F64, edges: Edges, errors: F64, differences: F64) -> F64:
+    """Return what the solution of the graph, which is linear in them, leaves of small errors (n, 6, m) of poses (n, 4, 4). `differences` (e, 6, m)
+    are the `edge_errors` of the poses less those of the measured motions. Node 0 is fixed."""
+    _, J_a, J_b = _linearised(poses, edges)
+    _, H, _ = _normal_equations(poses, edges)
+    g = _gradient(len(poses), edges.pairs, _weighted(J_a, edges), _weighted(J_b, edges), differences)
+    moved = _solve(H, -g.reshape(-1, g.shape[2])).reshape(errors.shape)
+    moved[0] = 0.0  # fixed but for rounding
+    return np.asarray(errors + moved)
+
+
+def _linearised(poses: F64, edges: Edges) -> tuple[F64, F64, F64]:
+    """Errors (e, 6) of the edges, and their derivatives (e, 6, 6) by xi of nodes a and b."""
     a, b = edges.pairs.T
     R_a, R_b, R_z = poses[a, :3, :3], poses[b, :3, :3], edges.measured[:, :3, :3]
     R_a_t, R_z_t = np.swapaxes(R_a, 1, 2), np.swapaxes(R_z, 1, 2)
@@ -91,15 +121,20 @@ def _normal_equations(poses: F64, edges: Edges) -> tuple[float, bsr_matrix, F64]
     J_a, J_b = np.zeros((2, len(a), 6, 6))
     J_a[:, :3, :3], J_a[:, :3, 3:], J_a[:, 3:, 3:] = -R_z_t, matmul(R_z_t, cross_matrices(t_a_b)), matmul(-np.swapaxes(R_b, 1, 2), R_a)
     J_b[:, :3, :3], J_b[:, 3:, 3:] = matmul(R_z_t, R_a_t, R_b), np.eye(3)
-    W_a, W_b = matmul(np.swapaxes(J_a, 1, 2), edges.information), matmul(np.swapaxes(J_b, 1, 2), edges.information)
-    n = len(poses)
-    blocks = np.concatenate([matmul(W_a, J_a), matmul(W_a, J_b), matmul(W_b, J_a), matmul(W_b, J_b), FIXED[None]])
-    rows, columns = np.concatenate([a, a, b, b, [0]]), np.concatenate([a, b, a, b, [0]])
-    g = np.zeros((n, 6))
-    np.add.at(g, a, matmul(W_a, error[..., None])[..., 0])
-    np.add.at(g, b, matmul(W_b, error[..., None])[..., 0])
-    cost = float(np.einsum("ei,eij,ej->", error, edges.information, error))
-    return cost, _assemble(blocks, rows, columns, n), g.ravel()
+    return error, J_a, J_b
+
+
+def _weighted(J: F64, edges: Edges) -> F64:
+    """Transposed derivatives (e, 6, 6) times the information of the edges."""
+    return np.asarray(matmul(np.swapaxes(J, 1, 2), edges.information))
+
+
+def _gradient(n: int, pairs: I32, W_a: F64, W_b: F64, errors: F64) -> F64:
+    """(n, 6, m) sum of the weighted errors (e, 6, m) over the edges of each node."""
+    g = np.zeros((n, 6, errors.shape[2]))
+    np.add.at(g, pairs[:, 0], matmul(W_a, errors))
+    np.add.at(g, pairs[:, 1], matmul(W_b, errors))
+    return g
 
 
 def _assemble(blocks: F64, rows: I32, columns: I32, n: int) -> bsr_matrix:

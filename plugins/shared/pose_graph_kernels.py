@@ -12,7 +12,7 @@ from trihedron.pipeline.core.types import F64, I32
 @kernel
 def solve_envelope(starts: I32, columns: I32, values: F64, g: F64) -> F64:
     """Solve `H x = g` for a symmetric positive definite H (n, n) in compressed rows, of which the lower triangle is read (George and Liu, Computer
-    Solution of Large Sparse Positive Definite Systems, 1981, chapter 4). Returns x (n,), NaN when H is not positive definite."""
+    Solution of Large Sparse Positive Definite Systems, 1981, chapter 4). Returns x (n, m), as g, NaN when H is not positive definite."""
     n = len(g)
     first = np.arange(n)  # column of each row's first element
     for i in range(n):
@@ -37,12 +37,14 @@ def solve_envelope(starts: I32, columns: I32, values: F64, g: F64) -> F64:
             elif total > 0.0:
                 L[at[i] + i] = np.sqrt(total)
             else:
-                return np.full(n, np.nan)
-        for k in range(first[i], i):
-            x[i] -= L[at[i] + k] * x[k]
-        x[i] /= L[at[i] + i]
+                return np.full(g.shape, np.nan)
+        for c in range(g.shape[1]):
+            for k in range(first[i], i):
+                x[i, c] -= L[at[i] + k] * x[k, c]
+            x[i, c] /= L[at[i] + i]
     for i in range(n - 1, -1, -1):
-        x[i] /= L[at[i] + i]
-        for k in range(first[i], i):
-            x[k] -= L[at[i] + k] * x[i]
+        for c in range(g.shape[1]):
+            x[i, c] /= L[at[i] + i]
+            for k in range(first[i], i):
+                x[k, c] -= L[at[i] + k] * x[i, c]
     return x

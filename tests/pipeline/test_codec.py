@@ -345,7 +345,18 @@ def test_a_value_of_an_older_version_names_the_version_and_the_fields():
     """As `Pose` was before sub-maps, with a field that there is no more."""
     message = legacy("pose")
     message.version = 1
-    later = {*LEARNED, "disagreement", "submap", "unrecognised", "map_covariance", "noise_scale", "repeats", "sensitivity", "twist"}
+    later = {
+        *LEARNED,
+        "disagreement",
+        "submap",
+        "unrecognised",
+        "map_covariance",
+        "noise_scale",
+        "repeats",
+        "sensitivity",
+        "relative_sensitivity",
+        "twist",
+    }
     later |= {"reference_twist", "keyframe_covariance", "lost_from", "missing", "depth_scale_sigma", "turn_difference", "usual_turn_difference"}
     later |= {"plane_offsets"}
     kept = [array for array in message.arrays if array.name not in later]
@@ -356,7 +367,7 @@ def test_a_value_of_an_older_version_names_the_version_and_the_fields():
         "'calibration_score', 'confirmations', 'depth_disagreement', 'depth_scale_sigma', 'disagreement', 'jumps', 'keyframe_covariance', "
         "'lost_from', 'map_covariance', 'missing', "
         "'noise_scale', 'plane_offsets', 'reference_twist', "
-        "'repeats', 'scale_difference', 'sensitivity', 'submap', 'turn_difference', 'twist', 'unrecognised', "
+        "'relative_sensitivity', 'repeats', 'scale_difference', 'sensitivity', 'submap', 'turn_difference', 'twist', 'unrecognised', "
         "'usual_accelerations', 'usual_depth_disagreement', 'usual_turn_difference' "
         "that it lacks, "
         "without its field 'quality'; upgrade what can be read of it with: trihedron convert SRC DST.mcap"

@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from trihedron.pipeline.core.geometry import invert
+from trihedron.pipeline.core.geometry import invert, transform
 from trihedron.pipeline.core.lie import adjoint, exp_se3, log_se3
 from trihedron.pipeline.core.types import CALIBRATION, CalibrationSigmas, Camera, Pose
+from trihedron.plugins.loop.manhattan_prior_kernels import Views, line_turns, plane_turns
 from trihedron.plugins.pose.calibration_uncertainty import carried_calibration, contradicted_calibration
 from trihedron.plugins.shared.calibration_error import calibration_covariance, calibration_scales
 from trihedron.plugins.shared.calibration_error_kernels import (
@@ -87,6 +88,7 @@ def test_errors_of_measurements_are_those_of_a_camera_with_that_error(parameter)
 
 AT_REST = ((np.eye(4), np.zeros(6)),)
 NO_ERROR = np.zeros((6, CALIBRATION))
+AT_TRUTH = (np.eye(4),) * 2
 MOVING = ((np.eye(4), TWIST[::-1]), (exp_se3(np.array([-0.1, 0.1, 0.0, 0.02, 0.03, 0.05])), -0.5 * TWIST))
 
 
@@ -98,14 +100,32 @@ def seen_from(T, twist, world, wall, theta):
     return CAMERA.back_project(pixels, depth) @ T[:3, :3].T + T[:3, 3]
 
 
-def two_views(theta, keyframes=AT_REST):
+def information_from(T, world):
+    """Information (n, 3, 3) that a keyframe at T has of points (n, 3) of the world, by pixels of 1 px and the noise of its depth."""
+    x, y, z = ((world - T[:3, 3]) @ T[:3, :3]).T
+    J, zero = np.empty((len(z), 3, 3)), np.zeros(len(z))  # of (u, v, z)
+    J[:, 0], J[:, 1] = (np.stack(row, axis=1) for row in ((CAMERA.fx / z, zero, -CAMERA.fx * x / z**2), (zero, CAMERA.fy / z, -CAMERA.fy * y / z**2)))
+    J[:, 2] = [0.0, 0.0, 1.0]
+    J = J @ T[:3, :3].T
+    weights = np.stack([np.ones(len(z)), np.ones(len(z)), 1.0 / CAMERA.depth_noise.sigma_m(z) ** 2], axis=1)
+    return np.swapaxes(J, 1, 2) @ (weights[:, :, None] * J)
+
+
+def placed_by(keyframes, world, wall, theta, moved):
+    """The points (n, 3) of the world where keyframes, each `moved` by its own motion, place them together: the mean, weighted by information."""
+    information = [information_from(T, world) for T, _ in keyframes]
+    seen = [transform(motion, seen_from(*keyframe, world, wall, theta)) for keyframe, motion in zip(keyframes, moved)]
+    return np.linalg.solve(sum(information), sum(W @ x[:, :, None] for W, x in zip(information, seen)))[:, :, 0]
+
+
+def two_views(theta, keyframes=AT_REST, moved=AT_TRUTH):
     """Keyframes, each with its pose and velocity, and a camera 0.4 m and 9° from the origin, all with the calibration error theta: the terms of the
-    points, which are where the keyframes place them on average, the surfaces that they lie on, and the true pose."""
+    points, which are where the keyframes, `moved` by errors of their poses, place them, the surfaces that they lie on, and the true pose."""
     rng, T = np.random.default_rng(1), exp_se3(np.array([0.3, 0.05, 0.25, 0.05, 0.14, -0.03]))
     terms, surfaces = [], []
     for wall in WALLS:
         world, local, plane = points_on(rng, wall, T, 60)
-        landmarks = np.mean([seen_from(*keyframe, world, wall, theta) for keyframe in keyframes], axis=0)
+        landmarks = placed_by(keyframes, world, wall, theta, moved)
         terms.append((landmarks, *measured(local, plane, theta, TWIST)[:2]))
         surfaces.append(np.tile(plane, (60, 1)))
     landmarks, pixels, depth = (np.concatenate(parts) for parts in zip(*terms))
@@ -115,9 +135,10 @@ def two_views(theta, keyframes=AT_REST):
 
 
 def keyframes_of(observers, errors=NO_ERROR):
-    """Keyframes that err alike by the calibration, as poses of the camera."""
+    """Keyframes that err by the calibration, alike (6, 12) or each by its own, as poses of the camera."""
     T, twists = (np.array(part) for part in zip(*observers))
-    return Keyframes(np.ascontiguousarray(T[:, :3, :3]), T[:, :3, 3].copy(), twists, np.tile(errors, (len(T), 1, 1)))
+    errors = np.ascontiguousarray(np.broadcast_to(errors, (len(T), 6, CALIBRATION)))
+    return Keyframes(np.ascontiguousarray(T[:, :3, :3]), T[:, :3, 3].copy(), twists, errors, CAMERA.depth_noise.coefficients)
 
 
 def equations_of(points, surfaces, T, keyframes=AT_REST, errors=NO_ERROR):
@@ -144,6 +165,28 @@ def test_sensitivity_is_the_error_of_the_pose(parameter, keyframes):
     expected = -np.linalg.solve(equations.H, equations.C @ unit)
     error = log_se3(invert(T) @ solution.T_world_camera)
     assert error == pytest.approx(expected, rel=0.1, abs=0.03 * np.abs(expected).max() + 1e-6)
+
+
+@pytest.mark.parametrize("direction", range(6))
+def test_a_pose_errs_as_the_keyframes_that_placed_its_landmarks(direction):
+    """One of two keyframes errs by 2 mm or 0.1°, and knows more of the landmarks than the other: the camera is off by what they make of it."""
+    xi = np.where(np.arange(6) == direction, 0.002 if direction < 3 else np.radians(0.1), 0.0)
+    near = exp_se3(np.array([0.2, 0.0, 1.2, 0.0, 0.1, 0.0])), np.zeros(6)
+    keyframes = (*AT_REST, near)
+    points, surfaces, T = two_views(np.zeros(CALIBRATION), keyframes, (np.eye(4), T_of_camera(xi)))
+    solution = solve_pose(T, CAMERA, T, 1e-6 * np.eye(6), points)
+    errors = np.zeros((2, 6, CALIBRATION))
+    errors[1, :, 0] = xi
+    equations, exact = equations_of(points, surfaces, T, keyframes, errors), equations_of(points, surfaces, T, keyframes)
+    expected = np.linalg.solve(equations.H, (exact.C - equations.C)[:, 0])
+    assert log_se3(invert(T) @ solution.T_world_camera) == pytest.approx(expected, rel=0.05, abs=0.02 * np.abs(expected).max())
+    assert np.abs(expected - 0.5 * xi).max() > 0.2 * np.abs(xi).max()  # not their mean
+
+
+def T_of_camera(xi):
+    """The motion (4, 4) of the world for xi (6,) of the camera of `two_views`."""
+    T = exp_se3(np.array([0.3, 0.05, 0.25, 0.05, 0.14, -0.03]))
+    return T @ exp_se3(xi) @ invert(T)
 
 
 def test_residuals_tell_of_the_calibration():
@@ -214,11 +257,13 @@ def test_points_of_a_plane_lie_where_a_camera_with_that_error_puts_them(paramete
     seen_by, sensitivity = seen_by._replace(errors=rng.normal(0.0, 0.1, (3, 6, CALIBRATION))), rng.normal(0.0, 0.1, (6, CALIBRATION))
     world, local, plane = (part[:5] for part in points_on(rng, WALLS[1], T, 12))  # in view of both keyframes, too
     expected = measured(local, plane, theta, TWIST)[2] @ plane[:3] + plane[3]
-    for pose, twist in MOVING:
+    weights = np.array([CAMERA.depth_noise.sigma_m(((world - pose[:3, 3]) @ pose[:3, :3])[:, 2]) ** -2 for pose, _ in MOVING])
+    weights /= weights.sum(axis=0)
+    by_poses = np.broadcast_to(1e-4 * sensitivity[:, parameter], (5, 6)) - 1e-4 * weights.T @ seen_by.errors[:2, :, parameter]
+    for weight, (pose, twist) in zip(weights, MOVING):
         then = np.append(pose[:3, :3].T @ WALLS[1][:3], WALLS[1][3] + WALLS[1][:3] @ pose[:3, 3])
-        expected -= 0.5 * (measured((world - pose[:3, 3]) @ pose[:3, :3], then, theta, twist)[2] @ then[:3] + then[3])
-    by_poses = 1e-4 * (sensitivity - seen_by.errors[:2].mean(axis=0))[:, parameter]
-    expected += plane[:3] @ by_poses[:3] + np.cross(local, plane[:3]) @ by_poses[3:]
+        expected -= weight * (measured((world - pose[:3, 3]) @ pose[:3, :3], then, theta, twist)[2] @ then[:3] + then[3])
+    expected += by_poses[:, :3] @ plane[:3] + (np.cross(local, plane[:3]) * by_poses[:, 3:]).sum(axis=1)
     moment = 1e-8 * np.outer(np.eye(CALIBRATION)[parameter], np.eye(CALIBRATION)[parameter])
     samples = np.append(local, [[np.nan] * 3, [0.0] * 3], axis=0)[None].astype(np.float32)
     for observers, known in (([0, 1, 2, -1], np.abs(expected)), ([2, -1, -1, -1], np.full(5, np.nan))):
@@ -227,6 +272,61 @@ def test_points_of_a_plane_lie_where_a_camera_with_that_error_puts_them(paramete
             np.array([observers], np.int32), seen_by,
         )  # fmt: skip
         assert found[0, :5] == pytest.approx(known, rel=1e-3, abs=1e-8, nan_ok=True) and np.isnan(found[0, 5:]).all()
+
+
+def views_of(keyframes, errors):
+    """Keyframes that err by the calibration (k, 6, 12), with their camera."""
+    T, twists = (np.array(part) for part in zip(*keyframes))
+    return Views(T, twists, errors, CAMERA.intrinsics, CAMERA.width, CAMERA.height, calibration_scales(CAMERA), CAMERA.depth_noise.coefficients)
+
+
+@pytest.mark.parametrize("parameter", range(CALIBRATION))
+def test_a_plane_turns_as_cameras_with_that_error_place_it(parameter):
+    """Two keyframes with the same error of calibration, by which their poses err, too; the rotation is that in the frame of the second."""
+    rng, scale, wall = np.random.default_rng(4), calibration_scales(CAMERA)[parameter], WALLS[1]
+    theta, errors = 1e-3 * scale * np.eye(CALIBRATION)[parameter], rng.normal(0.0, 0.1, (2, 6, CALIBRATION))
+    world = points_on(rng, wall, MOVING[1][0], 40)[0][:8]
+    weights, placed = [], []
+    for (T, twist), error in zip(MOVING, errors):
+        local = (world - T[:3, 3]) @ T[:3, :3]
+        then = np.append(T[:3, :3].T @ wall[:3], wall[3] + wall[:3] @ T[:3, 3])
+        placed.append(transform(T @ exp_se3(1e-3 * error[:, parameter]), measured(local, then, theta, twist)[2]))
+        weights.append(CAMERA.depth_noise.sigma_m(local[:, 2]) ** -2)
+    along = sum(w * ((x - world) @ wall[:3]) for w, x in zip(weights, placed)) / sum(weights)
+    R = MOVING[1][0][:3, :3]
+    normal, local = R.T @ wall[:3], (world - MOVING[1][0][:3, 3]) @ R
+    slopes = np.linalg.lstsq(np.c_[local, np.ones(8)] @ tangents(normal), along, rcond=None)[0]
+    turned = np.cross(normal, -tangents(normal)[:3, :2] @ slopes[:2])
+    found = plane_turns(
+        wall[None], world[None].astype(np.float32), np.array([[0, 1, -1]], np.int32), np.array([1], np.int32), views_of(MOVING, errors)
+    )
+    assert 1e-3 * found[0, :, parameter] == pytest.approx(turned, rel=0.02, abs=0.01 * np.linalg.norm(turned) + 1e-9)
+
+
+def tangents(normal):
+    """Columns (4, 3) that take points (x, y, z, 1) to coordinates across a normal, and 1."""
+    out = np.zeros((4, 3))
+    out[:3, :2], out[3, 2] = np.linalg.svd(normal[None])[2][1:].T, 1.0
+    return out
+
+
+@pytest.mark.parametrize("parameter", range(CALIBRATION))
+def test_a_line_turns_as_a_camera_with_that_error_places_it(parameter):
+    """A slanted line on a wall that the camera looks straight at, of which it has a part in its image; its pose errs, too."""
+    rng, scale, twist = np.random.default_rng(5), calibration_scales(CAMERA)[parameter], TWIST * [1.0, 1.0, 10.0, 1.0, 1.0, 1.0]
+    theta, errors = 1e-3 * scale * np.eye(CALIBRATION)[parameter], rng.normal(0.0, 0.01, (1, 6, CALIBRATION))
+    ends = np.array([[-0.4, -0.8, 3.0], [0.6, 1.0, 3.0]])
+    pixels, depth, _ = measured(ends, WALLS[0], theta, twist)
+    placed = transform(exp_se3(1e-3 * errors[0, :, parameter]), CAMERA.back_project(pixels, depth))
+    d = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
+    turned = np.cross(d, (placed[1] - placed[0] - (ends[1] - ends[0])) / np.linalg.norm(ends[1] - ends[0]))
+    first, none = np.zeros(1, np.int32), np.full((1, 2), -1, np.int32)
+    views = views_of(((np.eye(4), twist),), errors)
+    found = line_turns(ends[None], np.array([[0, -1]], np.int32), first, views)
+    assert 1e-3 * found[0, :, parameter] == pytest.approx(turned, rel=0.02, abs=0.02 * np.linalg.norm(turned) + 1e-8)
+    assert np.array_equal(line_turns(ends[None], none, first, views)[0], errors[0, 3:])
+    beside = ends + np.array([9.0, 0.0, 0.0])  # not in its image
+    assert np.array_equal(line_turns(beside[None], np.zeros((1, 1), np.int32), first, views)[0], errors[0, 3:])
 
 
 def test_moments_of_the_calibration():

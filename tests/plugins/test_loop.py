@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from trihedron.pipeline.core.geometry import invert, pose_matrix
-from trihedron.pipeline.core.lie import exp_se3
+from trihedron.pipeline.core.lie import exp_se3, log_se3
 from trihedron.pipeline.core.types import Frame, Matches, Pose
 from trihedron.plugins.loop.appearance import AppearanceLoop
 from trihedron.plugins.loop.loop_closing import accept_loop, path_lengths, place_of
@@ -19,7 +19,7 @@ from trihedron.plugins.mapping.correction import apply_correction
 from trihedron.plugins.mapping.covisibility_graph import observed_by
 from trihedron.plugins.mapping.landmark_kinds import KINDS, LINE, POINT
 from trihedron.plugins.matches.local_map import LocalMap
-from trihedron.plugins.shared.pose_graph import Edges, solve_pose_graph
+from trihedron.plugins.shared.pose_graph import Edges, edge_errors, remaining_errors, solve_pose_graph
 from trihedron.plugins.shared.pose_optimizer import solve_pose
 from trihedron.plugins.shared.residuals_kernels import PlaneTerms
 
@@ -199,3 +199,24 @@ def test_a_pose_graph_closes_a_circle():
     before, after = (np.linalg.norm(poses[:, :3, 3] - truth[:, :3, 3], axis=1) for poses in (np.array(start), solved))
     assert before[-1] > 0.08 and after[-1] < 1e-3 and after.max() < 0.7 * before.max()
     np.testing.assert_allclose(solved[:, :3, :3] @ np.swapaxes(solved[:, :3, :3], 1, 2), np.tile(np.eye(3), (n, 1, 1)), atol=1e-12)
+
+
+def test_a_closed_circle_leaves_what_the_graph_cannot_tell_of_common_errors():
+    """Poses that err by what grows round a circle, as do the odometry between them, but not the closing edge: what is left is linear in the error."""
+    rng, n = np.random.default_rng(2), 30
+    truth = np.array([exp_se3(np.array([0.0, 0.0, 0.0, 0.0, 2.0 * np.pi * i / n, 0.0])) for i in range(n)])
+    truth[:, :3, 3] = truth[:, :3, 2]
+    errors = rng.normal(size=(6, 2))[None] * (np.arange(n) / n)[:, None, None] ** 1.5
+    errors[-1, :, 1] = 0.0  # and one that cancels where the circle closes
+    start = np.array([T @ exp_se3(1e-4 * xi) for T, xi in zip(truth, errors[:, :, 0])])
+    pairs = np.array([*((i, i + 1) for i in range(n - 1)), *((i, i + 2) for i in range(n - 2)), (0, n - 1)], np.int32)
+    measured = invert(start[pairs[:, 0]]) @ start[pairs[:, 1]]
+    measured[-1] = invert(truth[0]) @ truth[-1]
+    edges = Edges(pairs, measured, np.tile(np.diag([1e5] * 3 + [1e6] * 3), (len(pairs), 1, 1)) * rng.uniform(0.5, 2.0, len(pairs))[:, None, None])
+    closing = (np.arange(len(pairs)) == len(pairs) - 1)[:, None, None]
+    left = remaining_errors(start, edges, errors, closing * edge_errors(start, edges, errors))
+    solved = np.array([log_se3(invert(T) @ S) for T, S in zip(truth, solve_pose_graph(start, edges))])
+    assert left[:, :, 0] == pytest.approx(1e4 * solved, abs=2e-3 * np.abs(errors).max())
+    assert np.linalg.norm(left[-1, :, 0]) < 0.2 * np.linalg.norm(errors[-1, :, 0])
+    assert left[:, :, 1] == pytest.approx(errors[:, :, 1], abs=1e-9)
+    assert remaining_errors(start, edges, errors, np.zeros((len(pairs), 6, 2))) == pytest.approx(errors)

@@ -9,12 +9,13 @@ from trihedron.pipeline.core.geometry import pose_matrix, transform_planes
 from trihedron.pipeline.core.lie import exp_so3, log_so3
 from trihedron.pipeline.core.types import CALIBRATION, Camera, Frame, Pose
 from trihedron.plugins.loop.appearance import AppearanceLoop
-from trihedron.plugins.loop.manhattan_prior import estimate_manhattan_prior
+from trihedron.plugins.loop.manhattan_prior import correct_loop, estimate_manhattan_prior
 from trihedron.plugins.loop.planes import PlanesLoop
 from trihedron.plugins.mapping import plane_fusion
 from trihedron.plugins.mapping.correction import apply_correction
 from trihedron.plugins.mapping.insertion import add_keyframe
 from trihedron.plugins.mapping.landmarks import OBSERVERS, empty_map
+from trihedron.plugins.shared.pose_optimizer import PoseSolution
 
 CAMERA = Camera(640, 480, 525.0, 520.0, 319.5, 239.5)
 KEYFRAMES, STEP_M = 64, 0.5
@@ -62,7 +63,7 @@ def errors_deg(rotations, truth):
 
 def test_the_prior_rotations_are_the_drift():
     map, truth = corridor(DRIFT)
-    prior = estimate_manhattan_prior(map)
+    prior = estimate_manhattan_prior(map, CAMERA)
     turned = np.array([log_so3(R @ exp_so3(phi) @ truth.T) for R, phi in zip(map.keyframes.column("T_world_camera")[:, :3, :3], prior.rotations)])
     common = turned.mean(axis=0)  # the axes themselves are found in the middle of the drift
     assert np.degrees(np.linalg.norm(turned - common, axis=1).max()) < 0.5 and np.degrees(np.linalg.norm(common)) < 0.6
@@ -92,8 +93,8 @@ def test_no_alignment_without_need():
 
 
 def test_no_alignment_without_a_manhattan_frame():
-    assert estimate_manhattan_prior(corridor(DRIFT, axes=(0, 0, 0))[0]) is None  # one direction alone
-    assert estimate_manhattan_prior(corridor(DRIFT, wall_deg=20.0)[0]) is None  # walls every way
+    assert estimate_manhattan_prior(corridor(DRIFT, axes=(0, 0, 0))[0], CAMERA) is None  # one direction alone
+    assert estimate_manhattan_prior(corridor(DRIFT, wall_deg=20.0)[0], CAMERA) is None  # walls every way
     assert PlanesLoop()(corridor(np.zeros(3), turned=np.radians(10.0))[0], frame()) is None  # the second half is another wing
     assert PlanesLoop()(corridor(np.zeros(3), turned=np.radians(3.0))[0], frame()) is None
 
@@ -107,4 +108,22 @@ def test_a_turn_that_the_calibration_explains_is_undone_though_it_is_no_drift():
     explained = dataclasses.replace(map, keyframes=map.keyframes.updated(np.arange(KEYFRAMES), sensitivity=sensitivity))
     moved = apply_correction(explained, PlanesLoop()(explained, frame()))
     assert errors_deg(moved.keyframes.column("T_world_camera")[:, :3, :3], truth).max() < 0.5
+    left = moved.keyframes.column("sensitivity")[:, 3:, 0]
+    assert np.linalg.norm(left[-1]) < 0.2 * np.linalg.norm(sensitivity[-1, 3:, 0])
     np.testing.assert_array_equal(moved.keyframes.column("T_world_camera")[0], map.keyframes.column("T_world_camera")[0])
+
+
+def test_a_closed_loop_leaves_no_error_of_the_calibration_where_it_closes():
+    """The newest keyframe errs by 0.3 m and 2° for each σ of a parameter, those between in proportion; a loop finds where it is."""
+    map, _ = corridor(np.zeros(3))
+    sensitivity = np.zeros((KEYFRAMES, 6, CALIBRATION))
+    sensitivity[:, 0, 3], sensitivity[:, 4, 3] = (np.linspace(0.0, size, KEYFRAMES) for size in (0.3, np.radians(2.0)))
+    map = dataclasses.replace(map, keyframes=map.keyframes.updated(np.arange(KEYFRAMES), sensitivity=sensitivity))
+    T, none = map.keyframes.row("T_world_camera", KEYFRAMES - 1), np.empty(0, np.uint8)
+    found = PoseSolution(T, 1e-8 * np.eye(6), np.empty((6, 0)), none, none, none, 0.0)
+    left = correct_loop(PlanesLoop(), map, 0, found, None).sensitivity
+    before = np.linalg.norm(sensitivity[:, :, 3], axis=1)
+    assert left.shape == sensitivity.shape and not np.delete(left, 3, axis=2).any()
+    after = np.linalg.norm(left[:, :, 3], axis=1)
+    assert after[-1] < 0.01 * before[-1] and after[0] == 0.0 and after.max() < before[-1]
+    assert left[-1] == pytest.approx(0.0, abs=1e-3)

@@ -8,14 +8,15 @@ from hydra import compose, initialize_config_module
 
 from trihedron.pipeline.core.config import graph_of, register_configs
 from trihedron.pipeline.core.geometry import invert, pose_matrix, transform, transform_planes
-from trihedron.pipeline.core.lie import exp_se3, exp_so3, log_se3, rotation_angle_deg
+from trihedron.pipeline.core.lie import adjoint, exp_se3, exp_so3, log_se3, rotation_angle_deg
 from trihedron.pipeline.core.registry import load_plugins
 from trihedron.pipeline.core.types import CALIBRATION, LOST, Correction, Map, Pose, Rotation
 from trihedron.pipeline.record.trajectories import read_trajectory
 from trihedron.pipeline.run.results import causal_trajectory, final_trajectory, write_results
 from trihedron.pipeline.run.runner import Runner
 from trihedron.plugins.mapping.landmarks import KEYFRAMES, empty_map
-from trihedron.plugins.mapping.reference_keyframe import transform_rotation_to_map, transform_to_map
+from trihedron.plugins.mapping.reference_keyframe import transform_rotation_to_map, transform_to_map, with_relative_sensitivity
+from trihedron.plugins.shared.calibration_error import calibration_covariance
 from trihedron.plugins.shared.covariances import transform_plane_covariance
 
 SHIFT = pose_matrix(exp_so3(np.radians([3.0, 4.0, 0.0])), np.array([0.2, -0.1, 0.2]))  # 5° and 0.3 m
@@ -49,6 +50,31 @@ def test_a_pose_follows_its_keyframe_and_is_untouched_otherwise():
     assert np.array_equal(moved.T_reference_camera, pose.T_reference_camera)
     unborn = replace(pose, reference=-1)
     assert transform_to_map(unborn, map_with(SHIFT @ first, second)) is unborn
+
+
+def test_the_error_by_the_calibration_follows_the_keyframe():
+    """A corrected keyframe errs less by the calibration, and so does a pose relative to it, by what both have in common."""
+    rng = np.random.default_rng(0)
+    keyframe, T = exp_se3(rng.normal(size=6)), exp_se3(rng.normal(size=6))
+    of_keyframe, more = rng.normal(size=(6, CALIBRATION)), 0.1 * rng.normal(size=(6, CALIBRATION))
+
+    def mapped(T_world_keyframe, sensitivity):
+        map = map_with(T_world_keyframe)
+        return replace(map, keyframes=map.keyframes.updated(np.zeros(1, np.int32), sensitivity=sensitivity[None]))
+
+    before = mapped(keyframe, of_keyframe)
+    pose = replace(pose_against(keyframe, T, reference=0), sensitivity=adjoint(invert(T) @ keyframe) @ of_keyframe + more)
+    pose = with_relative_sensitivity(pose, before)
+    assert pose.relative_sensitivity == pytest.approx(more)
+    known = calibration_covariance(pose)
+    pose = replace(pose, covariance=known + 2.0 * np.eye(6), map_covariance=known + np.eye(6))
+    assert transform_to_map(pose, mapped(SHIFT @ keyframe, of_keyframe)).sensitivity == pytest.approx(pose.sensitivity)
+    moved = transform_to_map(pose, mapped(SHIFT @ keyframe, np.zeros_like(of_keyframe)))
+    assert moved.sensitivity == pytest.approx(more)
+    assert moved.covariance - calibration_covariance(moved) == pytest.approx(2.0 * np.eye(6))
+    assert moved.map_covariance - calibration_covariance(moved) == pytest.approx(np.eye(6))
+    first = replace(pose, reference=-1)
+    assert with_relative_sensitivity(first, before) is first
 
 
 def test_rounding_does_not_grow_from_keyframe_to_keyframe():
