@@ -13,10 +13,10 @@ from trihedron.pipeline.core.types import CALIBRATION, F32, F64, I32
 from trihedron.plugins.shared.calibration_error_kernels import (
     LEAST_SAMPLES,
     Keyframes,
+    add_placed_error,
     distance_jacobian,
     in_view,
     keyframes_at,
-    keypoint_errors,
     placed_distance_error,
     to_keyframe,
     to_observers,
@@ -155,8 +155,7 @@ def line_turns(ends: F64, observers: I32, middle: I32, views: Views) -> F64:
     information that this gives of the direction. The surfaces beside the line are not known, and their slope is left out. A line of which no
     observer had two samples in its image turns as its middle observer does."""
     turns, p, q = np.zeros((len(ends), 3, CALIBRATION)), np.empty((2, 3)), np.empty((2, 3))
-    E, slope_unknown, moved, at = np.empty((3, CALIBRATION)), np.full(4, np.nan), np.empty((3, CALIBRATION)), np.empty(3)
-    camera, scales = views.camera, views.scales
+    E, moved, at, camera = np.empty((3, CALIBRATION)), np.empty((3, CALIBRATION)), np.empty(3), views.camera
     for i in range(len(ends)):
         T = views.poses[middle[i]]
         R, t = split_pose(T)
@@ -180,17 +179,10 @@ def line_turns(ends: F64, observers: I32, middle: I32, views: Views) -> F64:
             weight = (share * length / sigma_z(0.5 * (q[0, 2] + q[1, 2]), views.noise)) ** 2
             total += weight
             for end in range(2):
-                keypoint_errors(q[end], slope_unknown, keyframes.twists[k], camera, views.width, views.height, E)
-                signed, z = (weight if end else -weight) / (share * length), q[end, 2]
-                for c in range(CALIBRATION):
-                    x, y, w = z / camera[0] * E[0, c] * scales[c], z / camera[1] * E[1, c] * scales[c], -z * E[2, c] * scales[c]
-                    x, y, w = x + w * q[end, 0], y + w * q[end, 1], w * z
-                    for a in range(3):
-                        moved[a, c] += signed * (Q[a, 0] * x + Q[a, 1] * y + Q[a, 2] * w)
-                    x, y, w = keyframes.errors[k, 3, c], keyframes.errors[k, 4, c], keyframes.errors[k, 5, c]
-                    moved[0, c] += signed * (y * p[end, 2] - w * p[end, 1])
-                    moved[1, c] += signed * (w * p[end, 0] - x * p[end, 2])
-                    moved[2, c] += signed * (x * p[end, 1] - y * p[end, 0])
+                signed = (weight if end else -weight) / (share * length)
+                add_placed_error(
+                    q[end], p[end], Q, keyframes.errors[k], keyframes.twists[k], camera, views.width, views.height, views.scales, signed, E, moved
+                )
         if total == 0.0:
             turns[i] = views.sensitivities[middle[i], 3:]
         else:

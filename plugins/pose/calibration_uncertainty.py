@@ -5,8 +5,8 @@ for the first pose. A frame like its keyframes repeats their errors, so B grows 
 error of calibration is the same in all of them, and grows with the way from the origin where a random walk grows with its root. The residuals tell
 of θ by the pattern that it leaves in them. The covariance `B E[θθᵀ] Bᵀ` is added to that of the pose (a Schmidt–Kalman filter); no pose is corrected.
 
-A landmark is taken to be where the keyframes that observed it saw it on average, weighted by the information that each has of it. Lines, and
-relations of planes, tell nothing of θ here."""
+A landmark is taken to be where the keyframes that observed it saw it on average, weighted by the information that each has of it. Relations
+of planes, and the depth of lines, tell nothing of θ here."""
 
 from __future__ import annotations
 
@@ -48,12 +48,12 @@ def reference_velocity(pose: Pose, previous: Pose, map: Map) -> F64:
 def with_calibration(pose: Pose, previous: Pose, problem: MapAlignment, flags: Flags, keyframes: Keyframes, observed: Observers) -> Pose:
     """Give a refined pose its sensitivity to the calibration, and what its residuals add to what is known of that."""
     T, camera = constant(pose.T_world_camera, np.float64), problem.camera
-    points, _, planes = problem.terms(pose.T_world_camera)
+    points, lines, planes = problem.terms(pose.T_world_camera)
     samples = problem.map.planes.rows("samples_m", problem.matches.planes[:, 1])
     surfaces = problem.surfaces_at(problem.keypoints.pixels[problem.matches.keypoints[:, 0]])
     equations = calibration_equations(
-        T, camera.intrinsics, camera.width, camera.height, calibration_scales(camera), pose.twist, points, planes, flags, surfaces, samples, observed,
-        keyframes,
+        T, camera.intrinsics, camera.width, camera.height, calibration_scales(camera), pose.twist, points, lines, planes, flags, surfaces, samples,
+        observed, keyframes,
     )  # fmt: skip
     before = carried_sensitivity(pose, previous)
     sensitivity, information, score = sensitivity_and_evidence(equations, problem.information, before)

@@ -136,12 +136,13 @@ class MapAlignment:
 
     @cached_property
     def keyframes(self) -> tuple[I32, Groups, Observers]:
-        """The keyframes (k,) that created or observed the matched landmarks; which of them created each, and which observed each of the points and of
-        the identical planes."""
+        """The keyframes (k,) that created or observed the matched landmarks; which of them created each, and which observed each of the points, lines
+        and identical planes."""
         map, matches = self.map, self.matches
         first, observers = map.points.columns_at(matches.keypoints[:, 1], "first", "observers")
         created = Groups(first, map.lines.rows("first", matches.segments[:, 1]), map.planes.rows("first", self.plane_ids()))
-        observed = Observers(observers, map.planes.rows("observers", matches.planes[:, 1]))
+        of_lines, of_planes = (table.rows("observers", ids[:, 1]) for table, ids in ((map.lines, matches.segments), (map.planes, matches.planes)))
+        observed = Observers(observers, of_lines, of_planes)
         return number_keyframes(len(map.keyframes), created, observed), created, observed
 
     def surfaces_at(self, pixels: F32 | F64) -> F64:

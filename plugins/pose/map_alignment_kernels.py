@@ -15,7 +15,9 @@ from trihedron.plugins.shared.pose_optimizer_kernels import Groups
 def number_keyframes(count: int, created: Groups, observed: Observers) -> I32:
     """Replace rows of `count` keyframes by their numbers among the rows (k,) that occur, which are returned, increasing; -1 stays."""
     number = np.full(count, -1, np.int32)
-    columns = created.points, created.lines, created.planes, observed.points.reshape(-1), observed.planes.reshape(-1)
+    columns = (
+        created.points, created.lines, created.planes, observed.points.reshape(-1), observed.lines.reshape(-1), observed.planes.reshape(-1)
+    )  # fmt: skip
     for rows in columns:
         for i in range(len(rows)):
             if rows[i] >= 0:

@@ -16,7 +16,7 @@ from trihedron.pipeline.core.linalg_kernels import copy_matrix, inverse_positive
 from trihedron.pipeline.core.types import CALIBRATION, F32, F64, I32, U8
 from trihedron.plugins.shared.depth_image_kernels import sigma_z
 from trihedron.plugins.shared.lie_kernels import adjoint_between
-from trihedron.plugins.shared.pose_optimizer_kernels import Flags
+from trihedron.plugins.shared.pose_optimizer_kernels import INLIER, Flags
 from trihedron.plugins.shared.residuals_kernels import (
     NEAR_M,
     SAME,
@@ -24,10 +24,13 @@ from trihedron.plugins.shared.residuals_kernels import (
     PlaneTerms,
     PointTerms,
     Weights,
+    depth_direction,
     fill_weights,
+    line_residual,
     plane_residual,
     point_residual,
     pose_jacobian,
+    pose_jacobian_row,
     to_camera,
 )
 
@@ -48,20 +51,27 @@ class Keyframes(NamedTuple):
 
 
 class Observers(NamedTuple):
-    """Numbers of the keyframes that observed each point (n, o) and each identical plane (p, o), which are the first of the planes; -1 for none."""
+    """Numbers of the keyframes that observed each point (n, o), line (m, o) and identical plane (p, o), which are the first of the planes; -1 for
+    none."""
 
     points: I32
+    lines: I32
     planes: I32
 
 
 class Equations(NamedTuple):
-    """Normal equations by the pose, H (6, 6) and b (6,), and by the calibration, G (12, 12) and s (12,), with C (6, 12) between them."""
+    """Normal equations by the pose, H (6, 6) and b (6,), and by the calibration, G (12, 12) and s (12,), with C (6, 12) between them.
+
+    The depth of lines adds `H_depth` and `C_depth`: it moves the pose, but tells nothing of the calibration, since the surfaces beside a line, and so
+    the effects of registration and delay on its depth, are not known."""
 
     H: F64
     b: F64
     C: F64
     G: F64
     s: F64
+    H_depth: F64
+    C_depth: F64
 
 
 @kernel(forceinline=True)
@@ -243,6 +253,114 @@ def _add_points(
 
 
 @kernel(forceinline=True)
+def add_placed_error(
+    q: F64, p: F64, Q: F64, of_pose: F64, twist: F64, camera: F64, width: int, height: int, scales: F64, weight: float, E: F64, out: F64
+) -> None:
+    """Add to `out` (3, 12), times a weight, the error in the camera's frame of a point that a keyframe placed by its pixel and its depth there.
+
+    The point is q (3,) in the keyframe's frame, which Q turns to the camera's, where it is p (3,); `of_pose` (6, 12) is the error of the keyframe's
+    pose. The slope of the surface is left out. E (3, 12) is overwritten."""
+    keypoint_errors(q, np.full(4, np.nan), twist, camera, width, height, E)
+    z = q[2]
+    for c in range(CALIBRATION):
+        w = -z * E[2, c]
+        x, y, w = z / camera[0] * E[0, c] + w * q[0], z / camera[1] * E[1, c] + w * q[1], w * z
+        a, b, d = of_pose[3, c], of_pose[4, c], of_pose[5, c]
+        out[0, c] += weight * (scales[c] * (Q[0, 0] * x + Q[0, 1] * y + Q[0, 2] * w) + of_pose[0, c] + b * p[2] - d * p[1])
+        out[1, c] += weight * (scales[c] * (Q[1, 0] * x + Q[1, 1] * y + Q[1, 2] * w) + of_pose[1, c] + d * p[0] - a * p[2])
+        out[2, c] += weight * (scales[c] * (Q[2, 0] * x + Q[2, 1] * y + Q[2, 2] * w) + of_pose[2, c] + a * p[1] - b * p[0])
+
+
+@kernel(forceinline=True)
+def _line_end_error(
+    R: F64, t: F64, world: F64, p: F64, observers: I32, keyframes: Keyframes, twist: F64, camera: F64, width: int, height: int, scales: F64,
+    E: F64, out: F64,
+) -> bool:  # fmt: skip
+    """Fill `out` (3, 12): the mean error of the end of a line that its observers placed, weighted by the noise of their depth, less that of its
+    measurement; p (3,) is the end in the camera's frame. Returns False where the camera, or all observers, do not have it in their image."""
+    q, Q, weights = np.empty(3), np.empty((3, 3)), 0.0
+    out[:] = 0.0
+    if not in_view(p, camera, width, height):
+        return False
+    for k in observers:
+        if k < 0:
+            continue
+        to_camera(keyframes.R[k], keyframes.t[k], world, q)
+        if not in_view(q, camera, width, height):
+            continue
+        for a in range(3):
+            for b in range(3):
+                Q[a, b] = R[0, a] * keyframes.R[k, 0, b] + R[1, a] * keyframes.R[k, 1, b] + R[2, a] * keyframes.R[k, 2, b]
+        weight = 1.0 / sigma_z(q[2], keyframes.noise) ** 2
+        add_placed_error(q, p, Q, keyframes.errors[k], keyframes.twists[k], camera, width, height, scales, weight, E, out)
+        weights += weight
+    if weights == 0.0:
+        return False
+    out /= weights
+    add_placed_error(p, p, np.eye(3), np.zeros((6, CALIBRATION)), twist, camera, width, height, scales, -1.0, E, out)
+    return True
+
+
+@kernel
+def _add_lines(
+    R: F64, t: F64, camera: F64, width: int, height: int, scales: F64, twist: F64, lines: LineTerms, W: F64, V: F64, flags: U8, observers: I32,
+    keyframes: Keyframes, total: Equations,
+) -> None:  # fmt: skip
+    """Add the inliers among the lines: the distances of their ends in the image, of information W (m, 2, 2), and those in depth, V (m, 2, 2)."""
+    p, D, m, E = np.empty((2, 3)), np.empty(3), np.empty(3), np.empty((3, CALIBRATION))
+    error, J, K, r = np.empty((2, 3, CALIBRATION)), np.empty((2, 6)), np.empty((2, CALIBRATION)), np.empty(2)
+    for i in range(len(flags)):
+        if not flags[i]:
+            continue
+        known = True
+        for end in range(2):
+            world = lines.endpoints_m[i, end]
+            to_camera(R, t, world, p[end])
+            known = known and _line_end_error(
+                R, t, world, p[end], observers[i], keyframes, twist, camera, width, height, scales, E, error[end]
+            )  # fmt: skip
+        if not known:
+            continue
+        for end in range(2):
+            r[end] = line_residual(p[end], lines.endpoints_px[i], camera, D)[0]
+            pose_jacobian_row(D[0], D[1], D[2], p, end, J)
+            for c in range(CALIBRATION):
+                K[end, c] = D[0] * error[end, 0, c] + D[1] * error[end, 1, c] + D[2] * error[end, 2, c]
+        _add_pair(J, W[i], K, total.H, total.C)
+        _add_evidence(J, W[i], K, r, total)
+        if flags[i] == INLIER and depth_direction(lines.observed_m[i], m):
+            for end in range(2):
+                pose_jacobian_row(m[0], m[1], m[2], p, end, J)
+                for c in range(CALIBRATION):
+                    K[end, c] = m[0] * error[end, 0, c] + m[1] * error[end, 1, c] + m[2] * error[end, 2, c]
+            _add_pair(J, V[i], K, total.H_depth, total.C_depth)
+
+
+@kernel(forceinline=True)
+def _add_pair(J: F64, W: F64, K: F64, H: F64, C: F64) -> None:
+    """Add two residuals of information W (2, 2), with Jacobians J (2, 6) by the pose and K (2, 12) by the calibration, to H and C."""
+    for a in range(6):
+        x, y = J[0, a] * W[0, 0] + J[1, a] * W[1, 0], J[0, a] * W[0, 1] + J[1, a] * W[1, 1]
+        for k in range(6):
+            H[a, k] += x * J[0, k] + y * J[1, k]
+        for k in range(CALIBRATION):
+            C[a, k] += x * K[0, k] + y * K[1, k]
+
+
+@kernel(forceinline=True)
+def _add_evidence(J: F64, W: F64, K: F64, r: F64, total: Equations) -> None:
+    """Add the same residuals r (2,) to b, G and s."""
+    x, y = W[0, 0] * r[0] + W[0, 1] * r[1], W[1, 0] * r[0] + W[1, 1] * r[1]
+    for a in range(6):
+        total.b[a] += J[0, a] * x + J[1, a] * y
+    for a in range(CALIBRATION):
+        total.s[a] += K[0, a] * x + K[1, a] * y
+        v, w = K[0, a] * W[0, 0] + K[1, a] * W[1, 0], K[0, a] * W[0, 1] + K[1, a] * W[1, 1]
+        for k in range(CALIBRATION):
+            total.G[a, k] += v * K[0, k] + w * K[1, k]
+
+
+@kernel(forceinline=True)
 def in_view(p: F64, camera: F64, width: int, height: int) -> bool:
     """Return True for a point p (3,) of the camera's frame that the camera has in its image."""
     if not p[2] > NEAR_M:
@@ -343,21 +461,20 @@ def _add_planes(
 
 @kernel
 def calibration_equations(
-    T: F64, camera: F64, width: int, height: int, scales: F64, twist: F64, points: PointTerms, planes: PlaneTerms, flags: Flags, surfaces: F64,
-    samples: F32, observers: Observers, keyframes: Keyframes,
+    T: F64, camera: F64, width: int, height: int, scales: F64, twist: F64, points: PointTerms, lines: LineTerms, planes: PlaneTerms, flags: Flags,
+    surfaces: F64, samples: F32, observers: Observers, keyframes: Keyframes,
 ) -> Equations:  # fmt: skip
-    """Normal equations of the inliers among points and identical planes at the pose T (4, 4), for parameters in units of `scales` (12,)."""
+    """Normal equations of the inliers among points, lines and identical planes at the pose T (4, 4), for parameters in units of `scales` (12,)."""
     R, t = split_pose(T)
     total = Equations(
-        np.zeros((6, 6)), np.zeros(6), np.zeros((6, CALIBRATION)), np.zeros((CALIBRATION, CALIBRATION)), np.zeros(CALIBRATION)
+        np.zeros((6, 6)), np.zeros(6), np.zeros((6, CALIBRATION)), np.zeros((CALIBRATION, CALIBRATION)), np.zeros(CALIBRATION),
+        np.zeros((6, 6)), np.zeros((6, CALIBRATION)),
     )  # fmt: skip
-    no_lines = LineTerms(
-        np.empty((0, 2, 3)), np.empty((0, 2, 3, 3)), np.empty((0, 2, 2)), np.empty(0), np.empty((0, 2, 3)), np.empty((0, 2, 3, 3))
-    )  # fmt: skip
-    n, p = len(points.positions_m), len(planes.kinds)
-    weights = Weights(np.empty((n, 3, 3)), np.empty((0, 2, 2)), np.empty((0, 2, 2)), np.empty((p, 3, 3)))
-    fill_weights(R, t, camera, points, no_lines, planes, weights)
+    n, m, p = len(points.positions_m), len(lines.endpoints_m), len(planes.kinds)
+    weights = Weights(np.empty((n, 3, 3)), np.empty((m, 2, 2)), np.empty((m, 2, 2)), np.empty((p, 3, 3)))
+    fill_weights(R, t, camera, points, lines, planes, weights)
     _add_points(R, t, camera, width, height, scales, twist, points, weights.points, flags.points, surfaces, observers.points, keyframes, total)
+    _add_lines(R, t, camera, width, height, scales, twist, lines, weights.lines, weights.line_depths, flags.lines, observers.lines, keyframes, total)
     _add_planes(R, t, camera, width, height, scales, twist, planes, weights.planes, flags.planes, samples, observers.planes, keyframes, total)
     return total
 
@@ -398,7 +515,8 @@ def sensitivity_and_evidence(equations: Equations, prior: F64, before: F64) -> t
             score[a] -= share[i, a] * equations.b[i]
             for k in range(CALIBRATION):
                 information[a, k] -= 0.5 * (share[i, a] * cross[i, k] + cross[i, a] * share[i, k])
-    return -share, information, score
+    to_pose = inverse_positive(equations.H + equations.H_depth + prior)
+    return -matmul(to_pose, cross + equations.C_depth), information, score
 
 
 @kernel

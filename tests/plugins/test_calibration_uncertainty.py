@@ -21,9 +21,9 @@ from trihedron.plugins.shared.calibration_error_kernels import (
     sensitivity_and_evidence,
 )
 from trihedron.plugins.shared.plane_offsets_kernels import distance_sigmas
-from trihedron.plugins.shared.pose_optimizer import NO_PLANES, solve_pose
+from trihedron.plugins.shared.pose_optimizer import NO_LINES, NO_PLANES, solve_pose
 from trihedron.plugins.shared.pose_optimizer_kernels import Flags
-from trihedron.plugins.shared.residuals_kernels import PlaneTerms, PointTerms
+from trihedron.plugins.shared.residuals_kernels import LineTerms, PlaneTerms, PointTerms
 
 CAMERA = Camera(640, 480, 520.0, 530.0, 315.0, 245.0)
 TWIST = np.array([0.3, -0.2, 0.1, 0.2, -0.4, 0.3])
@@ -145,10 +145,11 @@ def equations_of(points, surfaces, T, keyframes=AT_REST, errors=NO_ERROR):
     """The equations at pose T of landmarks that all of these keyframes observed."""
     flags = Flags(np.ones(len(surfaces), np.uint8), np.empty(0, np.uint8), np.empty(0, np.uint8))
     seen_by = np.append(np.arange(len(keyframes), dtype=np.int32), np.int32(-1))  # and by none besides
-    observers = Observers(np.tile(seen_by, (len(surfaces), 1)), np.empty((0, len(seen_by)), np.int32))
+    none = np.empty((0, len(seen_by)), np.int32)
+    observers = Observers(np.tile(seen_by, (len(surfaces), 1)), none, none)
     samples, size = np.empty((0, 8, 3), np.float32), (CAMERA.width, CAMERA.height)
     return calibration_equations(
-        T, CAMERA.intrinsics, *size, calibration_scales(CAMERA), TWIST, points, NO_PLANES, flags, surfaces, samples, observers,
+        T, CAMERA.intrinsics, *size, calibration_scales(CAMERA), TWIST, points, NO_LINES, NO_PLANES, flags, surfaces, samples, observers,
         keyframes_of(keyframes, errors),
     )  # fmt: skip
 
@@ -189,6 +190,36 @@ def T_of_camera(xi):
     return T @ exp_se3(xi) @ invert(T)
 
 
+@pytest.mark.parametrize("parameter", [0, 1, 2, 3, 7, 8])
+def test_a_pose_by_lines_errs_as_they_were_placed(parameter):
+    """Lines alone, in the image and in depth, by parameters that do not shift depth along a slanted surface: the pose errs by the sensitivity, and
+    the image's residuals agree with the true error."""
+    unit = 0.1 * np.eye(CALIBRATION)[parameter]
+    rng, T = np.random.default_rng(6), exp_se3(np.array([0.3, 0.05, 0.25, 0.05, 0.14, -0.03]))
+    theta, n = unit * calibration_scales(CAMERA), 60
+    ends = [points_on(rng, wall, T, n) for wall in WALLS]
+    placed = np.concatenate([seen_from(*AT_REST[0], world, wall, theta) for (world, _, _), wall in zip(ends, WALLS)]).reshape(-1, 2, 3)
+    pixels, depth = (np.concatenate(part) for part in zip(*(measured(local, plane, theta, TWIST)[:2] for _, local, plane in ends)))
+    seen, small = CAMERA.back_project(pixels, depth).reshape(-1, 2, 3), np.tile(1e-5 * np.eye(3), (len(placed), 2, 1, 1))
+    lines = LineTerms(placed, small, pixels.reshape(-1, 2, 2), np.ones(len(placed)), seen, small)
+    none = PointTerms(np.empty((0, 3)), np.empty((0, 3, 3)), np.empty((0, 2)), np.empty(0), np.empty(0), np.empty(0))
+    solution = solve_pose(T, CAMERA, T, 1e-6 * np.eye(6), none, lines)
+    assert (solution.lines > 0).all()
+    flags = Flags(np.empty(0, np.uint8), solution.lines, np.empty(0, np.uint8))
+    nothing = np.empty((0, 1), np.int32)
+    observers = Observers(nothing, np.zeros((len(placed), 1), np.int32), nothing)
+    equations = calibration_equations(
+        solution.T_world_camera, CAMERA.intrinsics, CAMERA.width, CAMERA.height, calibration_scales(CAMERA), TWIST, none, lines, NO_PLANES, flags,
+        np.empty((0, 4)), np.empty((0, 8, 3), np.float32), observers, keyframes_of(AT_REST),
+    )  # fmt: skip
+    sensitivity, information, score = sensitivity_and_evidence(equations, np.zeros((6, 6)), NO_ERROR)
+    error = log_se3(invert(T) @ solution.T_world_camera)
+    expected = sensitivity @ unit
+    assert error == pytest.approx(expected, rel=0.1, abs=0.12 * np.abs(expected).max() + 1e-6)
+    assert information[parameter, parameter] > 0.0
+    assert score[parameter] / information[parameter, parameter] == pytest.approx(unit[parameter], rel=0.1)
+
+
 def test_residuals_tell_of_the_calibration():
     """Two views with random errors of every parameter: the estimate from their residuals agrees with the truth by its covariance, and is nearer to it
     than nothing known."""
@@ -196,7 +227,7 @@ def test_residuals_tell_of_the_calibration():
     points, surfaces, T = two_views(true * calibration_scales(CAMERA))
     solution = solve_pose(T, CAMERA, T, 1e-6 * np.eye(6), points)
     assert (solution.points > 0).all()
-    H, b, C, G, s = equations_of(points, surfaces, solution.T_world_camera)
+    H, b, C, G, s, *_ = equations_of(points, surfaces, solution.T_world_camera)
     information, score = G - C.T @ np.linalg.solve(H, C), s - C.T @ np.linalg.solve(H, b)
     covariance = np.linalg.inv(information + np.eye(CALIBRATION))
     error = covariance @ score - true
@@ -233,9 +264,10 @@ def test_of_a_plane_count_the_samples_that_both_views_show():
 
     def equations(samples):
         flags = Flags(np.empty(0, np.uint8), np.empty(0, np.uint8), np.ones(1, np.uint8))
-        observers = Observers(np.empty((0, 1), np.int32), np.zeros((1, 1), np.int32))
+        none = np.empty((0, 1), np.int32)
+        observers = Observers(none, none, np.zeros((1, 1), np.int32))
         return calibration_equations(
-            T, CAMERA.intrinsics, CAMERA.width, CAMERA.height, calibration_scales(CAMERA), TWIST, points, planes, flags, np.empty((0, 4)),
+            T, CAMERA.intrinsics, CAMERA.width, CAMERA.height, calibration_scales(CAMERA), TWIST, points, NO_LINES, planes, flags, np.empty((0, 4)),
             samples[None].astype(np.float32), observers, keyframes,
         )  # fmt: skip
 
