@@ -342,8 +342,8 @@ class Pose(Value):
     Six fields are what the pose's error owes to an imperfect calibration (`plugins.shared.calibration_error`, which defines the parameters and their
     units): `sensitivity` is the derivative of the error by them, `relative_sensitivity` what it has more than that of the reference keyframe,
     `calibration_information` and `calibration_score` the information of the residuals on them so far. `twist` is the camera's velocity (m/s, rad/s)
-    in its own frame, `reference_twist` that of the reference keyframe. `depth_scale_sigma` is the relative standard deviation of the
-    scale of all depths, of which residuals tell nothing."""
+    in its own frame, `reference_twist` that of the reference keyframe. `depth_scale_sigma` is the relative standard deviation of the scale of all
+    depths, of which residuals tell nothing."""
 
     version: ClassVar[int] = 11  # a field that is added last, with a default, needs no other: recordings number the fields in their order
 

@@ -83,14 +83,9 @@ def _retract(poses: F64, steps: F64) -> F64:
 
 def _normal_equations(poses: F64, edges: Edges) -> tuple[float, bsr_matrix, F64]:
     """Cost, (6n, 6n) approximate Hessian and (6n,) gradient of half the squared error."""
-    (a, b), n = edges.pairs.T, len(poses)
     error, J_a, J_b = _linearised(poses, edges)
-    W_a, W_b = _weighted(J_a, edges), _weighted(J_b, edges)
-    blocks = np.concatenate([matmul(W_a, J_a), matmul(W_a, J_b), matmul(W_b, J_a), matmul(W_b, J_b), FIXED[None]])
-    rows, columns = np.concatenate([a, a, b, b, [0]]), np.concatenate([a, b, a, b, [0]])
-    g = _gradient(n, edges.pairs, W_a, W_b, error[..., None])
-    cost = float(np.einsum("ei,eij,ej->", error, edges.information, error))
-    return cost, _assemble(blocks, rows, columns, n), g.ravel()
+    H, g = _equations(len(poses), edges, J_a, J_b, error[..., None])
+    return float(np.einsum("ei,eij,ej->", error, edges.information, error)), H, g.ravel()
 
 
 def edge_errors(poses: F64, edges: Edges, errors: F64) -> F64:
@@ -104,9 +99,8 @@ def remaining_errors(poses: F64, edges: Edges, errors: F64, differences: F64) ->
     """Return what the solution of the graph, which is linear in them, leaves of small errors (n, 6, m) of poses (n, 4, 4). `differences` (e, 6, m)
     are the `edge_errors` of the poses less those of the measured motions. Node 0 is fixed."""
     _, J_a, J_b = _linearised(poses, edges)
-    _, H, _ = _normal_equations(poses, edges)
-    g = _gradient(len(poses), edges.pairs, _weighted(J_a, edges), _weighted(J_b, edges), differences)
-    moved = _solve(H, -g.reshape(-1, g.shape[2])).reshape(errors.shape)
+    H, g = _equations(len(poses), edges, J_a, J_b, differences)
+    moved = _solve(H, -g).reshape(errors.shape)
     moved[0] = 0.0  # fixed but for rounding
     return np.asarray(errors + moved)
 
@@ -124,17 +118,16 @@ def _linearised(poses: F64, edges: Edges) -> tuple[F64, F64, F64]:
     return error, J_a, J_b
 
 
-def _weighted(J: F64, edges: Edges) -> F64:
-    """Transposed derivatives (e, 6, 6) times the information of the edges."""
-    return np.asarray(matmul(np.swapaxes(J, 1, 2), edges.information))
-
-
-def _gradient(n: int, pairs: I32, W_a: F64, W_b: F64, errors: F64) -> F64:
-    """(n, 6, m) sum of the weighted errors (e, 6, m) over the edges of each node."""
+def _equations(n: int, edges: Edges, J_a: F64, J_b: F64, errors: F64) -> tuple[bsr_matrix, F64]:
+    """(6n, 6n) approximate Hessian, and (6n, m) gradients for errors (e, 6, m) of the edges."""
+    a, b = edges.pairs.T
+    W_a, W_b = matmul(np.swapaxes(J_a, 1, 2), edges.information), matmul(np.swapaxes(J_b, 1, 2), edges.information)
+    blocks = np.concatenate([matmul(W_a, J_a), matmul(W_a, J_b), matmul(W_b, J_a), matmul(W_b, J_b), FIXED[None]])
+    rows, columns = np.concatenate([a, a, b, b, [0]]), np.concatenate([a, b, a, b, [0]])
     g = np.zeros((n, 6, errors.shape[2]))
-    np.add.at(g, pairs[:, 0], matmul(W_a, errors))
-    np.add.at(g, pairs[:, 1], matmul(W_b, errors))
-    return g
+    np.add.at(g, a, matmul(W_a, errors))
+    np.add.at(g, b, matmul(W_b, errors))
+    return _assemble(blocks, rows, columns, n), g.reshape(6 * n, -1)
 
 
 def _assemble(blocks: F64, rows: I32, columns: I32, n: int) -> bsr_matrix:
