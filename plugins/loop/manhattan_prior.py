@@ -1,7 +1,7 @@
 """The Manhattan prior of a whole map, and the corrections that use it: pose graphs of loops, and alignment of the map with its axes.
 
-Every keyframe is connected to those just before it, so a map drifts; directions repeat all through a building. Every plane and line of the map counts
-once, at the middle one of its observers, so that a wall off the axes errs once and not with each view.
+Every keyframe is connected to those just before it, so a map drifts until a place is seen again; directions repeat all through a building. Every
+plane and line of the map counts once, at the middle one of its observers, so that a wall off the axes errs once and not with each view.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from trihedron.pipeline.core.types import F64, I32, Camera, Correction, Map, Tab
 from trihedron.plugins.loop.calibration_turn import errors_by_calibration
 from trihedron.plugins.loop.keyframe_correction import correct_keyframes
 from trihedron.plugins.loop.manhattan_prior_kernels import Views, keyframe_rotations, line_turns, plane_turns
-from trihedron.plugins.mapping.covisibility_graph import DriftOptions, current_submap, keyframes_of, odometry
+from trihedron.plugins.mapping.covisibility_graph import DriftOptions, current_submap, keyframes_of, odometry, revisits
 from trihedron.plugins.shared.calibration_error import calibration_scales
 from trihedron.plugins.shared.manhattan_frames_kernels import (
     Walls,
@@ -117,7 +117,15 @@ def estimate_axes(planes: F64, covariance: F64, views: I32) -> F64 | None:
 # Corrections.
 
 
-class StraighteningOptions(DriftOptions, Protocol):
+class CorrectionOptions(DriftOptions, Protocol):
+    """Options of every correction of a map by a pose graph."""
+
+    @property
+    def shared(self) -> int:
+        """Points and lines that keyframes of two visits of a place share, from which on they are connected."""
+
+
+class StraighteningOptions(CorrectionOptions, Protocol):
     """Options of the alignment with the Manhattan frame."""
 
     @property
@@ -125,7 +133,7 @@ class StraighteningOptions(DriftOptions, Protocol):
         """Least rotation of the newest keyframe for which the map is corrected."""
 
 
-def correct_loop(options: DriftOptions, map: Map, keyframe: int, found: PoseSolution, prior: ManhattanPrior | None) -> Correction:
+def correct_loop(options: CorrectionOptions, map: Map, keyframe: int, found: PoseSolution, prior: ManhattanPrior | None) -> Correction:
     """Correct the tracked sub-map by a verified loop: the newest keyframe's pose, with its covariance, relative to `keyframe`. The sensitivities
     become those of the corrected poses; their covariance stays, although most drift is undone."""
     rows = keyframes_of(map, current_submap(map))
@@ -133,7 +141,7 @@ def correct_loop(options: DriftOptions, map: Map, keyframe: int, found: PoseSolu
     place, newest = np.searchsorted(rows, [keyframe, len(map.keyframes) - 1])
     information = np.asarray(inv(found.covariance), np.float64)[None]
     closing = Edges(np.array([[place, newest]], np.int32), matmul(invert(before[place]), found.T_world_camera)[None], information)
-    solved = _solve_with_prior(before, sensitivity, odometry_edges(options, map, rows), closing, prior)
+    solved = _solve_with_prior(before, sensitivity, present_edges(options, map, rows), closing, prior)
     correction = correct_keyframes(map, rows, before, solved.poses)
     return replace(correction, sensitivity=solved.sensitivity, added_covariance=np.zeros((len(rows), 6, 6)))
 
@@ -153,7 +161,7 @@ def align_with_manhattan(options: StraighteningOptions, map: Map, camera: Camera
     at_moved = replace(map, keyframes=map.keyframes.updated(prior.keyframes, T_world_camera=moved))
     turned = prior.sensitivity + errors.sensitivity[:, 3:] - sensitivity[:, 3:]
     rest = replace(prior, rotations=prior.rotations - errors.xi[:, 3:], sensitivity=turned)
-    solved = _solve_with_prior(moved, errors.sensitivity, odometry_edges(options, at_moved, prior.keyframes), NO_EDGES, rest)
+    solved = _solve_with_prior(moved, errors.sensitivity, present_edges(options, at_moved, prior.keyframes), NO_EDGES, rest)
     path_m = np.linalg.norm(np.diff(moved[:, :3, 3], axis=0), axis=1).sum()
     if _angles(moved, solved.poses).max() > PLAUSIBLE * np.radians(options.rotation_drift_deg) * np.sqrt(path_m):
         solved = Solved(moved, errors.sensitivity)
@@ -177,11 +185,12 @@ class Solved:
     sensitivity: F64
 
 
-def _solve_with_prior(before: F64, sensitivity: F64, odometry: Edges, closing: Edges, prior: ManhattanPrior | None) -> Solved:
+def _solve_with_prior(before: F64, sensitivity: F64, present: Edges, closing: Edges, prior: ManhattanPrior | None) -> Solved:
     """Solve for the poses of keyframes by a pose graph, in which the Manhattan frame is one more node, whose direction every keyframe measures.
-    Odometry errs by the calibration as the poses `before` do, by their `sensitivity`; a closed loop does not, and directions by that of the prior."""
-    count, edges = len(before), concatenate_edges(odometry, closing)
-    differences = np.concatenate([np.zeros((len(odometry.pairs), *sensitivity.shape[1:])), edge_errors(before, closing, sensitivity)])
+    Edges of the `present` poses `before` err by the calibration as these do, by their `sensitivity`; a closing loop does not, and directions by that
+    of the prior."""
+    count, edges = len(before), concatenate_edges(present, closing)
+    differences = np.concatenate([np.zeros((len(present.pairs), *sensitivity.shape[1:])), edge_errors(before, closing, sensitivity)])
     if prior is not None:
         axes = pose_matrix(prior.R_world_manhattan, np.zeros(3))
         before, sensitivity = np.concatenate([before, axes[None]]), np.concatenate([sensitivity, np.zeros_like(sensitivity[:1])])
@@ -203,7 +212,9 @@ def _directions(nodes: F64, prior: ManhattanPrior) -> Edges:
     return Edges(pairs, measured, information)
 
 
-def odometry_edges(options: DriftOptions, map: Map, rows: I32) -> Edges:
-    """Return edges between neighbours in time; their covariance is that of the later keyframe's pose plus the drift along the path."""
-    pairs = np.concatenate([np.stack([np.arange(len(rows) - k), np.arange(k, len(rows))], axis=1) for k in range(1, LINKS + 1)])
+def present_edges(options: CorrectionOptions, map: Map, rows: I32) -> Edges:
+    """Return edges that measure the map as it is: between neighbours in time, and between keyframes of different visits of a place, without which a
+    correction would open the loops that were closed. Their covariance is that of the later keyframe's pose plus the drift along the path."""
+    neighbours = [np.stack([np.arange(len(rows) - k), np.arange(k, len(rows))], axis=1) for k in range(1, LINKS + 1)]
+    pairs = np.concatenate([*neighbours, revisits(map, rows, options.shared, LINKS)])
     return Edges(pairs.astype(np.int32), *odometry(options, map, rows[pairs], LINKS))

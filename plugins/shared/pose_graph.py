@@ -15,12 +15,13 @@ from trihedron.plugins.shared.lie_kernels import log_so3_each
 from trihedron.plugins.shared.pose_graph_kernels import solve_envelope
 
 if TYPE_CHECKING:  # imported where it is needed: SciPy is slow to load, and most runs close no loop
-    from scipy.sparse import bsr_matrix
+    from scipy.sparse import bsr_matrix, csr_matrix
 
 
 ITERATIONS, CONVERGED = 20, 1e-9  # squared length of a step, metres and radians
 FIXED = 1e12 * np.eye(6)  # information of a fixed pose
 MAX_DAMPING = 1e8
+DENSE = 10.0  # elements of a dense row, per root of the number of rows (Amestoy, Davis and Duff, TOMS 2004)
 
 
 @dataclass(frozen=True)
@@ -62,15 +63,23 @@ def solve_pose_graph(poses: F64, edges: Edges) -> F64:
 
 
 def _solve(H: bsr_matrix, g: F64) -> F64:
-    """Solve `H x = g` (6n, m) for a symmetric positive definite H (6n, 6n), with nodes in the order of reverse Cuthill and McKee, which keeps the
-    factor narrow."""
-    from scipy.sparse.csgraph import reverse_cuthill_mckee
-
-    order = reverse_cuthill_mckee(H.tocsr(), symmetric_mode=True)
-    permuted = H.tocsr()[order][:, order]
+    """Solve `H x = g` (6n, m) for a symmetric positive definite H (6n, 6n)."""
+    H = H.tocsr()
+    order = elimination_order(H)
+    permuted = H[order][:, order]
     x = np.empty(g.shape)
     x[order] = solve_envelope(permuted.indptr, permuted.indices, permuted.data, g[order])
     return x
+
+
+def elimination_order(H: csr_matrix) -> I32:
+    """Return the rows of a symmetric matrix in the order of reverse Cuthill and McKee, which keeps its Cholesky factor narrow. Dense rows, as that of
+    a direction that all nodes measure, would leave nothing to order, and come last."""
+    from scipy.sparse.csgraph import reverse_cuthill_mckee
+
+    dense = np.diff(H.indptr) > DENSE * np.sqrt(H.shape[0])
+    rest = np.flatnonzero(~dense)
+    return np.append(rest[reverse_cuthill_mckee(H[rest][:, rest], symmetric_mode=True)], np.flatnonzero(dense)).astype(np.int32)
 
 
 def _retract(poses: F64, steps: F64) -> F64:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.sparse import csr_matrix
 
 from trihedron.pipeline.core.geometry import invert, pose_matrix
 from trihedron.pipeline.core.lie import exp_se3, log_se3
@@ -19,7 +20,7 @@ from trihedron.plugins.mapping.correction import apply_correction
 from trihedron.plugins.mapping.covisibility_graph import observed_by
 from trihedron.plugins.mapping.landmark_kinds import KINDS, LINE, POINT
 from trihedron.plugins.matches.local_map import LocalMap
-from trihedron.plugins.shared.pose_graph import Edges, edge_errors, remaining_errors, solve_pose_graph
+from trihedron.plugins.shared.pose_graph import Edges, edge_errors, elimination_order, remaining_errors, solve_pose_graph
 from trihedron.plugins.shared.pose_optimizer import solve_pose
 from trihedron.plugins.shared.residuals_kernels import PlaneTerms
 
@@ -220,3 +221,16 @@ def test_a_closed_circle_leaves_what_the_graph_cannot_tell_of_common_errors():
     assert np.linalg.norm(left[-1, :, 0]) < 0.2 * np.linalg.norm(errors[-1, :, 0])
     assert left[:, :, 1] == pytest.approx(errors[:, :, 1], abs=1e-9)
     assert remaining_errors(start, edges, errors, np.zeros((len(pairs), 6, 2))) == pytest.approx(errors)
+
+
+def test_a_node_that_all_others_are_connected_to_does_not_widen_the_factor():
+    """A chain of 400 nodes in any order, each linked to three, and one that all of them measure: it is last, and the factor of the rest narrow."""
+    count, rng = 400, np.random.default_rng(3)
+    near = np.abs(np.subtract.outer(np.arange(count), np.arange(count))) <= 3
+    H = np.ones((count + 1, count + 1), np.int32)
+    H[:count, :count] = near
+    shuffled = rng.permutation(count + 1)
+    order = elimination_order(csr_matrix(H[shuffled][:, shuffled]))
+    assert np.array_equal(np.sort(order), np.arange(count + 1)) and shuffled[order[-1]] == count
+    ordered = H[shuffled[order]][:, shuffled[order]][:count, :count]
+    assert (np.arange(count) - ordered.argmax(axis=1)).max() <= 6

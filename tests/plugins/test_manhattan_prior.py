@@ -5,14 +5,15 @@ import dataclasses
 import numpy as np
 import pytest
 
-from trihedron.pipeline.core.geometry import pose_matrix, transform_planes
-from trihedron.pipeline.core.lie import exp_so3, log_so3
+from trihedron.pipeline.core.geometry import invert, pose_matrix, transform_planes
+from trihedron.pipeline.core.lie import exp_so3, log_se3, log_so3
 from trihedron.pipeline.core.types import CALIBRATION, Camera, Frame, Pose
 from trihedron.plugins.loop.appearance import AppearanceLoop
 from trihedron.plugins.loop.manhattan_prior import correct_loop, estimate_manhattan_prior
 from trihedron.plugins.loop.planes import PlanesLoop
 from trihedron.plugins.mapping import plane_fusion
 from trihedron.plugins.mapping.correction import apply_correction
+from trihedron.plugins.mapping.covisibility_graph import revisits
 from trihedron.plugins.mapping.insertion import add_keyframe
 from trihedron.plugins.mapping.landmarks import OBSERVERS, empty_map
 from trihedron.plugins.shared.pose_optimizer import PoseSolution
@@ -23,14 +24,15 @@ AXES = exp_so3(np.array([0.3, -0.4, 0.1]))  # R_world_manhattan
 DRIFT = np.radians([0.1, 0.7, -0.2])  # at the end of the walk
 
 
-def corridor(drift, axes=(0, 1, 2), turned=0.0, wall_deg=0.1):
-    """A map of keyframes along a corridor whose rotations drift, each with three new walls that are true to `wall_deg`; those of the second half
-    stand on axes `turned` (rad) from the others. Returns the map and the rotations as they should be."""
+def corridor(drift, axes=(0, 1, 2), turned=0.0, wall_deg=0.1, back=False):
+    """A map of keyframes along a corridor, with `back` there and back, whose rotations drift, each with three new walls that are true to `wall_deg`;
+    those of the second half stand on axes `turned` (rad) from the others. Returns the map and the rotations as they should be."""
     rng, map = np.random.default_rng(0), empty_map(0, 0, 32, 32, 4)
     covariance = np.tile(np.diag([1e-7, 1e-7, 1e-6]), (3, 1, 1))
     look, wing = exp_so3(np.array([0.0, 0.3, 0.0])), AXES @ exp_so3(np.array([turned, 0.0, 0.0]))
     for i in range(KEYFRAMES):
-        T = pose_matrix(exp_so3(drift * i / (KEYFRAMES - 1)) @ look if i else look, np.array([0.0, 0.0, STEP_M * i]))
+        far = STEP_M * (min(i, KEYFRAMES - 1 - i) if back else i)
+        T = pose_matrix(exp_so3(drift * i / (KEYFRAMES - 1)) @ look if i else look, np.array([0.0, 0.0, far]))
         pose = Pose(i, i * 33_000_000, T, np.eye(6) * 1e-8, T, -1, np.zeros(3, np.int32), 0, "ok", "")
         map, row = add_keyframe(map, pose, CAMERA)
         normals = (AXES if i < KEYFRAMES / 2 else wing)[:, list(axes)].T
@@ -50,6 +52,37 @@ def corridor(drift, axes=(0, 1, 2), turned=0.0, wall_deg=0.1):
         )
         map = dataclasses.replace(map, planes=table, index=i, stamp_ns=i * 33_000_000)
     return map, look
+
+
+def with_shared_points(map, visits):
+    """The map with new points, of which each of `visits` names how many and the keyframes that observed them."""
+    seen = [[] for _ in range(len(map.keyframes))]
+    for count, keyframes in visits:
+        table, ids = map.points.appended(
+            position_m=np.zeros((count, 3)),
+            information=np.tile(np.eye(3, dtype=np.float32), (count, 1, 1)),
+            descriptor=np.zeros((count, 32), np.uint8),
+            direction=np.zeros((count, 3), np.float32),
+            distance_m=np.ones(count, np.float32),
+            octave=np.zeros(count, np.uint8),
+            first=np.full(count, keyframes[0]),
+            observers=np.tile(np.r_[keyframes[::-1], np.full(OBSERVERS - len(keyframes), -1)], (count, 1)),
+            found=np.ones(count, np.int32),
+            visible=np.ones(count, np.int32),
+            alive=np.ones(count, np.bool_),
+        )
+        map = dataclasses.replace(map, points=table)
+        for keyframe in keyframes:
+            seen[keyframe].extend(ids)
+    for keyframe, ids in enumerate(seen):
+        begin, one = len(map.point_observations), np.ones(len(ids), np.float32)
+        table, _ = map.point_observations.appended(
+            keyframe=np.full(len(ids), keyframe), point=np.array(ids, np.int32), pixel=np.zeros((len(ids), 2), np.float32), depth_m=one,
+            sigma_px=one, sigma_m=one,
+        )  # fmt: skip
+        spans = np.array([[begin, begin + len(ids)]], np.int32)
+        map = dataclasses.replace(map, point_observations=table, keyframes=map.keyframes.updated(np.array([keyframe]), points=spans))
+    return map
 
 
 def frame():
@@ -127,3 +160,26 @@ def test_a_closed_loop_leaves_no_error_of_the_calibration_where_it_closes():
     after = np.linalg.norm(left[:, :, 3], axis=1)
     assert after[-1] < 0.01 * before[-1] and after[0] == 0.0 and after.max() < before[-1]
     assert left[-1] == pytest.approx(0.0, abs=1e-3)
+
+
+def test_visits_are_told_apart_by_what_keyframes_share():
+    """Keyframes 10 to 13 share points with each other, 40 and 41 came back to them and 60 to both; 13 and 17 share too few."""
+    shared = [(30, (10, 11, 12, 13)), (20, (11, 40)), (10, (11, 12, 40, 41)), (40, (12, 41, 60)), (29, (13, 17))]
+    map, rows = with_shared_points(corridor(np.zeros(3))[0], shared), np.arange(KEYFRAMES, dtype=np.int32)
+    assert revisits(map, rows, 30, 3).tolist() == [[11, 40], [12, 41], [12, 60], [41, 60]]
+    assert revisits(map, rows, 29, 3).tolist() == [[13, 17], [11, 40], [12, 41], [12, 60], [41, 60]]
+    assert revisits(map, rows, 30, 20).tolist() == [[11, 40], [12, 41], [12, 60]]  # from 41 to 60 there are 18
+    assert revisits(map, rows[12:], 30, 3).tolist() == [[0, 29], [0, 48], [29, 48]]
+    assert revisits(map, rows[:2], 30, 3).shape == (0, 2)
+
+
+def test_an_alignment_does_not_open_a_loop_that_was_closed():
+    """A corridor there and back, whose walls turn the keyframes, so that its ends move; two that share points stay where they saw each other."""
+    map, _ = corridor(DRIFT, back=True)
+    first, last, opened = 2, KEYFRAMES - 3, {}
+    for name, known in (("without", map), ("with", with_shared_points(map, [(60, (first, last))]))):
+        poses = apply_correction(known, PlanesLoop()(known, frame())).keyframes.column("T_world_camera")
+        before = map.keyframes.column("T_world_camera")
+        opened[name] = np.linalg.norm(log_se3(invert(invert(before[first]) @ before[last]) @ invert(poses[first]) @ poses[last])[:3])
+    print(f"the loop is opened by {1000 * opened['without']:.0f} mm, with points that both share by {1000 * opened['with']:.0f} mm")
+    assert opened["without"] > 0.05 and opened["with"] < 0.1 * opened["without"]
