@@ -46,7 +46,7 @@ class LoopOptions:
     straighten: NonNegativeInt = 16  # keyframes between two alignments of the map with its Manhattan frame, doubled when the map doubles; 0 = never
     straighten_deg: PositiveFloat = 0.05  # least rotation of the newest keyframe that is worth it
     candidates: PositiveInt = 5  # verified in one call, at most
-    shared: PositiveInt = 30  # points and lines already shared with a place, from which on no loop is open there
+    shared: PositiveInt = 30  # points and lines already shared with a place, from which on no loop is open there and keyframes are connected
     min_score: PositiveInt = 60  # points + 2 lines + 5 planes that must agree
     min_share: Share = 0.5  # of the matches that must agree
     max_through: Share = 0.15  # of the place's surfaces in view that the camera may see through

@@ -42,9 +42,9 @@ def test_scale_of_residuals_is_unknown_for_one_keyframe_and_without_any():
 
 def test_keyframes_of_landmarks_are_numbered_in_the_order_of_time():
     created = Groups(*(np.array(rows, np.int32) for rows in ([7, 2, 7], [], [5])))
-    observed = Observers(np.array([[7, -1], [2, 9], [7, -1]], np.int32), np.array([[5, -1]], np.int32))
-    assert number_keyframes(12, created, observed).tolist() == [2, 5, 7, 9]
-    assert [part.tolist() for part in (*created, *observed)] == [[2, 0, 2], [], [1], [[2, -1], [0, 3], [2, -1]], [[1, -1]]]
+    observed = Observers(np.array([[7, -1], [2, 9], [7, -1]], np.int32), np.array([[3, 7]], np.int32), np.array([[5, -1]], np.int32))
+    assert number_keyframes(12, created, observed).tolist() == [2, 3, 5, 7, 9]
+    assert [part.tolist() for part in (*created, *observed)] == [[3, 0, 3], [], [2], [[3, -1], [0, 4], [3, -1]], [[1, 3]], [[2, -1]]]
 
 
 def test_average_of_a_random_walk():
