@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from trihedron.pipeline.core.geometry import pose_matrix, quaternion_xyzw
+from trihedron.pipeline.core.geometry import invert, pose_matrix, quaternion_xyzw
 from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import F64
 
@@ -75,6 +75,12 @@ def adjoint(T: F64) -> F64:
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):  # t × R; np.cross takes six times as long
         out[..., i, 3:] = t[..., j, :] * R[..., k, :] - t[..., k, :] * R[..., j, :]
     return out
+
+
+def adjoint_between(T: F64, other: F64) -> F64:
+    """Return the adjoints (..., 6, 6) of `T⁻¹ · other`, poses (..., 4, 4): they take xi of cameras at `other` to that of cameras at T that move with
+    these."""
+    return adjoint(matmul(invert(T), other))
 
 
 def rotation_angle_deg(R: F64) -> float:

@@ -10,8 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trihedron.pipeline.core.geometry import invert
-from trihedron.pipeline.core.lie import adjoint
+from trihedron.pipeline.core.lie import adjoint_between
 from trihedron.pipeline.core.linalg import inv, matmul, solve
 from trihedron.pipeline.core.types import CALIBRATION, F64, I32
 
@@ -61,7 +60,7 @@ def errors_by_calibration(poses: F64, rotations: F64, information: F64, sensitiv
 
 def _carried(poses: F64, sensitivity: F64, rows: I32) -> F64:
     """Return the sensitivity (k, 6, 12) of a camera that moves rigidly with keyframe `rows[i]` to keyframe i."""
-    return np.asarray(matmul(adjoint(matmul(invert(poses), poses[rows])), sensitivity[rows]))
+    return np.asarray(matmul(adjoint_between(poses, poses[rows]), sensitivity[rows]))
 
 
 def _independent(weighted: F64, residuals: F64) -> float:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from trihedron.pipeline.core.geometry import invert, rigid, transform, transform_each, transform_planes
-from trihedron.pipeline.core.lie import adjoint
+from trihedron.pipeline.core.lie import adjoint_between
 from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import F64, I32, Bool, Correction, Map, Table
 from trihedron.plugins.mapping.covisibility_graph import observed_by
@@ -47,7 +47,7 @@ def _correct_errors(map: Map, ids: I32, last: int, later: I32, sensitivity: F64,
     differ from the newest of these, `ids[last]`, as they did."""
     T, old = (map.keyframes.row(name, int(ids[last])) for name in ("T_world_camera", "sensitivity"))
     poses, own = map.keyframes.columns_at(later, "T_world_camera", "sensitivity")
-    to_later = adjoint(matmul(invert(poses), T))
+    to_later = adjoint_between(poses, T)
     rows = np.concatenate([ids, later])
     sensitivity = np.concatenate([sensitivity, own + matmul(to_later, sensitivity[last] - old)])
     added = np.concatenate([added, matmul(to_later, added[last], np.swapaxes(to_later, 1, 2))])

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from trihedron.pipeline.core.geometry import invert
-from trihedron.pipeline.core.lie import adjoint
+from trihedron.pipeline.core.lie import adjoint_between
 from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import F64, I32, Map, Pose, Table
 from trihedron.plugins.mapping.correction import transform_landmarks
@@ -81,11 +81,11 @@ def _world_covariance(map: Map, rows: I32, recognised: Pose) -> F64:
     """Covariances (k, 6, 6) of keyframes in the world that their sub-map is merged into: their own, plus that of the recognised pose, which they all
     move with, relative to a keyframe of that world, and of this keyframe."""
     poses, covariance = (map.keyframes.rows(name, rows) for name in ("T_world_camera", "world_covariance"))
-    to_rows = adjoint(matmul(invert(poses), recognised.T_world_camera))
+    to_rows = adjoint_between(poses, recognised.T_world_camera)
     common = recognised.covariance
     if recognised.reference >= 0:
         T, of_reference = (map.keyframes.rows(name, np.array([recognised.reference]))[0] for name in ("T_world_camera", "world_covariance"))
-        to_pose = adjoint(matmul(invert(recognised.T_world_camera), T))
+        to_pose = adjoint_between(recognised.T_world_camera, T)
         common = common + matmul(to_pose, of_reference, to_pose.T)
     return np.asarray(covariance + matmul(to_rows, common, to_rows.transpose(0, 2, 1)))
 
@@ -97,8 +97,8 @@ def _sensitivity(map: Map, rows: I32, pose: Pose, recognised: Pose) -> F64:
     common = -pose.sensitivity
     if recognised.reference >= 0:
         T, of_reference = (map.keyframes.rows(name, np.array([recognised.reference]))[0] for name in ("T_world_camera", "sensitivity"))
-        common = common + matmul(adjoint(matmul(invert(recognised.T_world_camera), T)), of_reference)
-    return np.asarray(own + matmul(adjoint(matmul(invert(poses), recognised.T_world_camera)), common))
+        common = common + matmul(adjoint_between(recognised.T_world_camera, T), of_reference)
+    return np.asarray(own + matmul(adjoint_between(poses, recognised.T_world_camera), common))
 
 
 def _created_by(table: Table, keyframes: I32) -> I32:

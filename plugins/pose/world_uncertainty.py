@@ -12,9 +12,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from trihedron.pipeline.core.geometry import invert
 from trihedron.pipeline.core.kernel import constant
-from trihedron.pipeline.core.lie import adjoint
+from trihedron.pipeline.core.lie import adjoint_between
 from trihedron.pipeline.core.linalg import eigvalsh, matmul
 from trihedron.pipeline.core.types import F64, I32, Map, Pose
 from trihedron.plugins.mapping.reference_keyframe import with_relative_sensitivity
@@ -40,7 +39,7 @@ class KeyframeUncertainty:
     def covariance(self, map: Map, T_world_camera: F64) -> F64:
         """Covariance (6, 6) of the keyframe as that of xi of a camera that moves with it."""
         T, covariance = (map.keyframes.rows(name, np.array([self.keyframe]))[0] for name in ("T_world_camera", "covariance"))
-        to_camera = adjoint(matmul(invert(T_world_camera), T))
+        to_camera = adjoint_between(T_world_camera, T)
         return np.asarray(matmul(to_camera, covariance, to_camera.T))
 
 
@@ -119,7 +118,7 @@ def _with_world_covariance(pose: Pose, by_drift: F64) -> Pose:
 
 def drift_of_previous(pose: Pose, previous: Pose) -> F64:
     """The part of the previous pose's `map_covariance` that is not by the calibration, as that of a camera that moves with it."""
-    to_camera = adjoint(matmul(invert(pose.T_world_camera), previous.T_world_camera))
+    to_camera = adjoint_between(pose.T_world_camera, previous.T_world_camera)
     return np.asarray(matmul(to_camera, previous.map_covariance - calibration_covariance(previous), to_camera.T))
 
 
