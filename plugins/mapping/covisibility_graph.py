@@ -125,23 +125,31 @@ def covisible_keyframes(map: Map, keyframes: I32, count: int) -> I32:
 def revisits(map: Map, keyframes: I32, shared: int, links: int) -> I32:
     """Return pairs (e, 2) of indices among the keyframes (sorted), the earlier first, that share at least `shared` points and lines although more
     than `links` keyframes between them share less: the camera left and came back. Of each earlier visit it is the keyframe that shares most."""
-    count, pairs, found = len(keyframes), [np.empty(0, np.int64)], []
-    for kind in (POINT, LINE):
-        _, observed, ends = observed_by_each(map, keyframes, kind)
-        by_landmark = np.argsort(observed, kind="stable")[np.count_nonzero(observed < 0) :]
-        landmarks, observers, apart = observed[by_landmark], np.repeat(np.arange(count), np.diff(ends, prepend=0))[by_landmark], 1
-        while (same := landmarks[apart:] == landmarks[:-apart]).any():  # a landmark with k observers gives pairs up to k - 1 apart
-            pairs.append(observers[apart:][same] * count + observers[:-apart][same])
-            apart += 1
-    pair, common = np.unique(np.concatenate(pairs), return_counts=True)
-    later, earlier = np.divmod(pair[common >= shared], max(count, 1))
-    common = common[common >= shared]
-    visits = np.flatnonzero((np.diff(later, prepend=-1) > 0) | (np.diff(earlier, prepend=-1) > links))
-    for visit in np.split(np.arange(len(later)), visits[1:]):
+    earlier, later, common = _sharing(map, keyframes)
+    earlier, later, common = (values[common >= shared] for values in (earlier, later, common))
+    begins = np.flatnonzero((np.diff(later, prepend=-1) > 0) | (np.diff(earlier, prepend=-1) > links))
+    found = []
+    for visit in np.split(np.arange(len(later)), begins[1:]):
         if len(visit) and later[visit[-1]] - earlier[visit[-1]] > links:
             best = visit[np.argmax(common[visit])]
             found.append((earlier[best], later[best]))
     return np.array(found, np.int32).reshape(-1, 2)
+
+
+def _sharing(map: Map, keyframes: I32) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Pairs of indices (p,) among the keyframes, the earlier and the later, sorted by the later and then the earlier, that share points or lines, and
+    how many (p,)."""
+    pairs = [np.empty(0, np.int64)]
+    for kind in (POINT, LINE):
+        _, observed, ends = observed_by_each(map, keyframes, kind)
+        by_landmark = np.argsort(observed, kind="stable")[np.count_nonzero(observed < 0) :]
+        landmarks, observers, apart = observed[by_landmark], np.repeat(np.arange(len(keyframes)), np.diff(ends, prepend=0))[by_landmark], 1
+        while (same := landmarks[apart:] == landmarks[:-apart]).any():  # a landmark with k observers gives pairs up to k - 1 apart
+            pairs.append(observers[apart:][same] * len(keyframes) + observers[:-apart][same])
+            apart += 1
+    pair, common = np.unique(np.concatenate(pairs), return_counts=True)
+    later, earlier = np.divmod(pair, max(len(keyframes), 1))
+    return earlier, later, common
 
 
 # Local windows.

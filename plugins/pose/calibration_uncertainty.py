@@ -32,7 +32,7 @@ from trihedron.plugins.shared.plane_offsets_kernels import distance_sigmas
 from trihedron.plugins.shared.pose_optimizer_kernels import Flags
 
 REPEATED_FRAMES = 100  # in which the errors of a landmark's residuals repeat: so many frames tell of the calibration as much as one
-NOTICED_FRAMES = 20  # the same where the calibration is judged: estimates by few frames are held to what is stated, which hid an error for a second
+NOTICED_FRAMES = 20  # the same where the stated calibration is judged: with more, its prior hides a large error for a second
 CALIBRATION_SIGMAS = 2.0  # root mean square of the parameters beyond which the calibration is not that of the camera
 
 
