@@ -19,6 +19,7 @@ from trihedron.plugins.loop.calibration_turn import errors_by_calibration
 from trihedron.plugins.loop.keyframe_correction import correct_keyframes
 from trihedron.plugins.loop.manhattan_prior_kernels import Views, keyframe_rotations, line_turns, plane_turns
 from trihedron.plugins.mapping.covisibility_graph import DriftOptions, current_submap, keyframes_of, odometry, revisits
+from trihedron.plugins.mapping.landmarks import index_of
 from trihedron.plugins.shared.calibration_error import calibration_scales
 from trihedron.plugins.shared.manhattan_frames_kernels import (
     Walls,
@@ -77,16 +78,10 @@ def estimate_manhattan_prior(map: Map, camera: Camera) -> ManhattanPrior | None:
     views = Views(
         poses, twists, sensitivity, camera.intrinsics, camera.width, camera.height, calibration_scales(camera), camera.depth_noise.coefficients
     )
-    of_planes = plane_turns(coefficients, samples, _numbers(rows, seen_by), at_plane, views)
-    of_lines = line_turns(ends, _numbers(rows, map.lines.rows("observers", lines)), at_line, views)
+    of_planes = plane_turns(coefficients, samples, index_of(seen_by, rows), at_plane, views)
+    of_lines = line_turns(ends, index_of(map.lines.rows("observers", lines), rows), at_line, views)
     turns, observers = np.concatenate([of_planes, of_lines]), np.concatenate([at_plane, at_line])
     return ManhattanPrior(R, rows, *keyframe_rotations(vectors, information, turns, observers, R, poses, np.cos(REACH), GATE))
-
-
-def _numbers(rows: I32, keyframes: I32) -> I32:
-    """Return where keyframes (any shape) are in `rows` (sorted), -1 for those that are not."""
-    at = np.minimum(np.searchsorted(rows, keyframes), len(rows) - 1)
-    return np.where(rows[at] == keyframes, at, -1).astype(np.int32)
 
 
 def _middle_observers(landmarks: Table, keyframes: I32) -> tuple[I32, I32]:
@@ -95,9 +90,8 @@ def _middle_observers(landmarks: Table, keyframes: I32) -> tuple[I32, I32]:
     observers = np.sort(landmarks.rows("observers", ids), axis=1)
     count = (observers >= 0).sum(axis=1)
     middle = observers[np.arange(len(ids)), np.minimum(observers.shape[1] - count + count // 2, observers.shape[1] - 1)]
-    place = np.minimum(np.searchsorted(keyframes, middle), len(keyframes) - 1)
-    known = (count > 0) & (keyframes[place] == middle) if len(keyframes) else np.zeros(len(ids), np.bool_)
-    return ids[known], place[known].astype(np.int32)
+    place = index_of(middle, keyframes)
+    return ids[place >= 0], place[place >= 0]
 
 
 def estimate_axes(planes: F64, covariance: F64, views: I32) -> F64 | None:

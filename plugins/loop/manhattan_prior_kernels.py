@@ -141,8 +141,8 @@ def plane_turns(planes: F64, samples: F32, observers: I32, middle: I32, views: V
         if seen < LEAST_SAMPLES:
             turns[i] = views.sensitivities[middle[i], 3:]
             continue
-        slopes = matmul(inverse_positive(N), X)  # points move along the normal, which turns by -B slopes
-        _fill_turn(now, -matmul(B, slopes[:2].copy()), turns[i])
+        fitted = matmul(inverse_positive(N), X)  # points move along the normal, which turns by -B times the first two
+        _fill_turn(now, -matmul(B, fitted[:2].copy()), turns[i])
     return turns
 
 

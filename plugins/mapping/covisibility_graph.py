@@ -123,8 +123,9 @@ def covisible_keyframes(map: Map, keyframes: I32, count: int) -> I32:
 
 
 def revisits(map: Map, keyframes: I32, shared: int, links: int) -> I32:
-    """Return pairs (e, 2) of indices among the keyframes (sorted), the earlier first, that share at least `shared` points and lines although more
-    than `links` keyframes between them share less: the camera left and came back. Of each earlier visit it is the keyframe that shares most."""
+    """Return pairs (e, 2) of indices among the keyframes (sorted), the earlier first, that share at least `shared` points and lines although at
+    least `links` keyframes in a row between them share less with the later: the camera left and came back. Of each visit it is the one that shares
+    most."""
     earlier, later, common = _sharing(map, keyframes)
     earlier, later, common = (values[common >= shared] for values in (earlier, later, common))
     begins = np.flatnonzero((np.diff(later, prepend=-1) > 0) | (np.diff(earlier, prepend=-1) > links))

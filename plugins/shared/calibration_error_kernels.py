@@ -15,7 +15,7 @@ from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.linalg_kernels import copy_matrix, inverse_positive, invert_symmetric, matmul, matvec, split_pose, tangent_columns
 from trihedron.pipeline.core.types import CALIBRATION, F32, F64, I32, U8
 from trihedron.plugins.shared.depth_image_kernels import sigma_z
-from trihedron.plugins.shared.lie_kernels import adjoint_between
+from trihedron.plugins.shared.lie_kernels import adjoint_between, rotation_between
 from trihedron.plugins.shared.pose_optimizer_kernels import INLIER, Flags
 from trihedron.plugins.shared.residuals_kernels import (
     NEAR_M,
@@ -193,9 +193,7 @@ def _point_calibration_jacobian(
         to_camera(keyframes.R[k], keyframes.t[k], world, q)
         if not q[2] > NEAR_M:
             continue
-        for a in range(3):
-            for b in range(3):
-                Q[a, b] = R[0, a] * keyframes.R[k, 0, b] + R[1, a] * keyframes.R[k, 1, b] + R[2, a] * keyframes.R[k, 2, b]
+        rotation_between(R, keyframes.R[k], Q)
         _plane_then(surface, Q, p, q, then)
         for c in range(CALIBRATION):
             x, y, z = keyframes.errors[k, 3, c], keyframes.errors[k, 4, c], keyframes.errors[k, 5, c]
@@ -288,9 +286,7 @@ def _line_end_error(
         to_camera(keyframes.R[k], keyframes.t[k], world, q)
         if not in_view(q, camera, width, height):
             continue
-        for a in range(3):
-            for b in range(3):
-                Q[a, b] = R[0, a] * keyframes.R[k, 0, b] + R[1, a] * keyframes.R[k, 1, b] + R[2, a] * keyframes.R[k, 2, b]
+        rotation_between(R, keyframes.R[k], Q)
         weight = 1.0 / sigma_z(q[2], keyframes.noise) ** 2
         add_placed_error(q, p, Q, keyframes.errors[k], keyframes.twists[k], camera, width, height, scales, weight, E, out)
         weights += weight

@@ -63,15 +63,22 @@ def log_so3_each(R: F64) -> F64:
     return out
 
 
+@kernel(forceinline=True)
+def rotation_between(R: F64, other: F64, out: F64) -> None:
+    """Fill the upper left 3 × 3 of `out` with `Rᵀ · other`, of rotations or poses."""
+    for i in range(3):
+        for k in range(3):
+            out[i, k] = R[0, i] * other[0, k] + R[1, i] * other[1, k] + R[2, i] * other[2, k]
+
+
 @kernel
 def adjoint_between(T: F64, other: F64, out: F64) -> None:
     """Fill the adjoint (6, 6) of `T⁻¹ · other`, two poses (4, 4): it takes xi of a camera at `other` to that of a camera at T that moves with it."""
     out[:] = 0.0
     t = np.empty(3)
+    rotation_between(T, other, out)
     for i in range(3):
         t[i] = T[0, i] * (other[0, 3] - T[0, 3]) + T[1, i] * (other[1, 3] - T[1, 3]) + T[2, i] * (other[2, 3] - T[2, 3])
-        for k in range(3):
-            out[i, k] = T[0, i] * other[0, k] + T[1, i] * other[1, k] + T[2, i] * other[2, k]
     for i, j, m in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         for k in range(3):
             out[3 + i, 3 + k] = out[i, k]

@@ -327,8 +327,8 @@ def test_a_plane_turns_as_cameras_with_that_error_place_it(parameter):
     along = sum(w * ((x - world) @ wall[:3]) for w, x in zip(weights, placed)) / sum(weights)
     R = MOVING[1][0][:3, :3]
     normal, local = R.T @ wall[:3], (world - MOVING[1][0][:3, 3]) @ R
-    slopes = np.linalg.lstsq(np.c_[local, np.ones(8)] @ tangents(normal), along, rcond=None)[0]
-    turned = np.cross(normal, -tangents(normal)[:3, :2] @ slopes[:2])
+    fitted = np.linalg.lstsq(np.c_[local, np.ones(8)] @ tangents(normal), along, rcond=None)[0]
+    turned = np.cross(normal, -tangents(normal)[:3, :2] @ fitted[:2])
     found = plane_turns(
         wall[None], world[None].astype(np.float32), np.array([[0, 1, -1]], np.int32), np.array([1], np.int32), views_of(MOVING, errors)
     )
