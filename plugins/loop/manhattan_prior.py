@@ -12,10 +12,10 @@ from typing import Protocol
 import numpy as np
 
 from trihedron.pipeline.core.geometry import invert, pose_matrix
-from trihedron.pipeline.core.lie import exp_se3, exp_so3
+from trihedron.pipeline.core.lie import exp_se3, exp_so3, log_so3
 from trihedron.pipeline.core.linalg import inv, inv_symmetric, matmul
 from trihedron.pipeline.core.types import F64, I32, Camera, Correction, Map, Table
-from trihedron.plugins.loop.calibration_turn import errors_by_calibration
+from trihedron.plugins.loop.calibration_turn import CalibrationErrors, errors_by_calibration
 from trihedron.plugins.loop.keyframe_correction import correct_keyframes
 from trihedron.plugins.loop.manhattan_prior_kernels import Views, keyframe_rotations, line_turns, plane_turns
 from trihedron.plugins.mapping.covisibility_graph import DriftOptions, current_submap, keyframes_of, odometry, revisits
@@ -34,11 +34,12 @@ from trihedron.plugins.shared.pose_optimizer import PoseSolution
 
 LINKS = 3  # further keyframes each is connected to, so that a stretch that was observed often stays stiff
 UNKNOWN = 1e-6  # 1/m², information of the position of a direction: none
-PLAUSIBLE = 3.0  # standard deviations of the drift that the prior may correct; beyond, the directions are those of another wing
+PLAUSIBLE = 3.0  # standard deviations of a keyframe's rotation that the prior may correct; beyond, the directions are those of another wing
 WALLS = 60  # planes, those observed most often, from which the axes are estimated
 MAX_COS, LARGEST_COS = 0.05, 0.2  # of two walls at right angles, see `perpendicular_pair`
 WALL_SIGMA, EDGE_SIGMA = np.radians(0.3), np.radians(0.5)  # of walls and edges about the axes: no building is exactly Manhattan
 REACH = np.radians(2.0)  # within which a direction belongs to an axis
+PASSES = 3  # of aligning: a direction that one brings within REACH of an axis counts in the next
 GATE = 2.0  # σ at which a robust weight is one half
 EXPLAINED = 0.5  # share of the walls (by views) that must stand on the axes
 NO_MEANS = np.zeros((0, 3))
@@ -46,9 +47,21 @@ NO_EDGES = Edges(np.zeros((0, 2), np.int32), np.zeros((0, 4, 4)), np.zeros((0, 6
 
 
 @dataclass(frozen=True)
+class Directions:
+    """Directions of n planes and lines of a map: `vectors` (n, 3) of the world with their information (n, 3, 3), and `turns` (n, 3, 12), by which the
+    calibration turns them in the frames of the keyframes `observers` (n,), each the middle one of those that observed it, at `poses` (k, 4, 4)."""
+
+    vectors: F64
+    information: F64
+    turns: F64
+    observers: I32
+    poses: F64
+
+
+@dataclass(frozen=True)
 class ManhattanPrior:
     """`R_world_manhattan` (3, 3), the keyframes' rows (k,) and, for each, phi of `R_world_camera · Exp(phi)` that agrees best with the axes (k, 3)
-    and its information (k, 3, 3), zero about directions that the keyframe's landmarks do not observe.
+    and its information (k, 3, 3), zero about directions that the keyframe's landmarks do not observe. `directions` are those of all landmarks.
 
     `sensitivity` (k, 3, 12) is the derivative by the calibration of the rotation of these landmarks, in the keyframe's frame: they turn with the
     poses that they were placed from, and since the same camera measured them."""
@@ -58,6 +71,7 @@ class ManhattanPrior:
     rotations: F64
     information: F64
     sensitivity: F64
+    directions: Directions
 
 
 def estimate_manhattan_prior(map: Map, camera: Camera) -> ManhattanPrior | None:
@@ -81,7 +95,20 @@ def estimate_manhattan_prior(map: Map, camera: Camera) -> ManhattanPrior | None:
     of_planes = plane_turns(coefficients, samples, index_of(seen_by, rows), at_plane, views)
     of_lines = line_turns(ends, index_of(map.lines.rows("observers", lines), rows), at_line, views)
     turns, observers = np.concatenate([of_planes, of_lines]), np.concatenate([at_plane, at_line])
-    return ManhattanPrior(R, rows, *keyframe_rotations(vectors, information, turns, observers, R, poses, np.cos(REACH), GATE))
+    return _prior_near(R, rows, Directions(vectors, information, turns, observers, poses), poses)
+
+
+def _prior_near(R_world_manhattan: F64, keyframes: I32, directions: Directions, expected: F64) -> ManhattanPrior:
+    """The prior by those directions that are near an axis once the keyframes are at the `expected` poses (k, 4, 4), and turn with them."""
+    turned = matmul(expected[:, :3, :3], np.swapaxes(directions.poses[:, :3, :3], 1, 2))
+    with_keyframe = turned[directions.observers]
+    vectors = matmul(with_keyframe, directions.vectors[..., None])[..., 0]
+    information = matmul(with_keyframe, directions.information, np.swapaxes(with_keyframe, 1, 2))
+    phi, information, sensitivity = keyframe_rotations(
+        vectors, information, directions.turns, directions.observers, R_world_manhattan, expected, np.cos(REACH), GATE
+    )
+    R = matmul(np.swapaxes(directions.poses[:, :3, :3], 1, 2), expected[:, :3, :3], np.array([exp_so3(x) for x in phi]))
+    return ManhattanPrior(R_world_manhattan, keyframes, np.array([log_so3(x) for x in R]), information, sensitivity, directions)
 
 
 def _middle_observers(landmarks: Table, keyframes: I32) -> tuple[I32, I32]:
@@ -144,31 +171,20 @@ def align_with_manhattan(options: StraighteningOptions, map: Map, camera: Camera
     """Rotate every keyframe back to the Manhattan frame of the map; None without one, or where the newest would hardly rotate.
 
     What the calibration explains is undone first (`calibration_turn`); keyframes up to the row `since` have been aligned before. The rest is drift,
-    and is left alone where some keyframe would turn by more than is plausible for drift."""
+    and is left alone where some keyframe would turn by more than is plausible by drift and by what is left of the calibration."""
     prior = estimate_manhattan_prior(map, camera)
     if prior is None:
         return None
-    before, sensitivity = map.keyframes.columns_at(prior.keyframes, "T_world_camera", "sensitivity")
-    last = max(int(np.searchsorted(prior.keyframes, since, "right")) - 1, 0)
-    errors = errors_by_calibration(before, prior.rotations, prior.information, sensitivity, prior.sensitivity, last)
-    moved = matmul(before, np.array([exp_se3(x) for x in errors.xi]))
-    at_moved = replace(map, keyframes=map.keyframes.updated(prior.keyframes, T_world_camera=moved))
-    turned = prior.sensitivity + errors.sensitivity[:, 3:] - sensitivity[:, 3:]
-    rest = replace(prior, rotations=prior.rotations - errors.xi[:, 3:], sensitivity=turned)
-    solved = _solve_with_prior(moved, errors.sensitivity, present_edges(options, at_moved, prior.keyframes), NO_EDGES, rest)
-    path_m = np.linalg.norm(np.diff(moved[:, :3, 3], axis=0), axis=1).sum()
-    if _angles(moved, solved.poses).max() > PLAUSIBLE * np.radians(options.rotation_drift_deg) * np.sqrt(path_m):
-        solved = Solved(moved, errors.sensitivity)
+    aligned = _align(options, map, prior, since)
+    for _ in range(PASSES - 1):
+        prior = _prior_near(prior.R_world_manhattan, prior.keyframes, prior.directions, aligned.solved.poses)
+        aligned = _align(options, map, prior, since)
+    solved = aligned.solved if _plausible(options, aligned) else Solved(aligned.undone, aligned.errors.sensitivity)
+    before = prior.directions.poses
     if _angles(before, solved.poses)[-1] < np.radians(options.straighten_deg):
         return None
     correction = correct_keyframes(map, prior.keyframes, before, solved.poses)
-    return replace(correction, sensitivity=solved.sensitivity, added_covariance=errors.covariance)
-
-
-def _angles(before: F64, after: F64) -> F64:
-    """Return the angles (k,), in rad, between poses (k, 4, 4)."""
-    cosine = 0.5 * (np.einsum("kij,kij->k", before[:, :3, :3], after[:, :3, :3]) - 1.0)
-    return np.asarray(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    return replace(correction, sensitivity=solved.sensitivity, added_covariance=aligned.errors.covariance)
 
 
 @dataclass(frozen=True)
@@ -177,6 +193,42 @@ class Solved:
 
     poses: F64
     sensitivity: F64
+
+
+@dataclass(frozen=True)
+class Aligned:
+    """Keyframes that are aligned with the Manhattan frame: their `errors` by the calibration, their poses (k, 4, 4) once these are `undone`, and what
+    the pose graph makes of them."""
+
+    errors: CalibrationErrors
+    undone: F64
+    solved: Solved
+
+
+def _align(options: StraighteningOptions, map: Map, prior: ManhattanPrior, since: int) -> Aligned:
+    """Align the keyframes of the prior with the Manhattan frame, see `align_with_manhattan`."""
+    before, sensitivity = map.keyframes.columns_at(prior.keyframes, "T_world_camera", "sensitivity")
+    last = max(int(np.searchsorted(prior.keyframes, since, "right")) - 1, 0)
+    errors = errors_by_calibration(before, prior.rotations, prior.information, sensitivity, prior.sensitivity, last)
+    undone = matmul(before, np.array([exp_se3(x) for x in errors.xi]))
+    at_undone = replace(map, keyframes=map.keyframes.updated(prior.keyframes, T_world_camera=undone))
+    turned = prior.sensitivity + errors.sensitivity[:, 3:] - sensitivity[:, 3:]
+    rest = replace(prior, rotations=prior.rotations - errors.xi[:, 3:], sensitivity=turned)
+    present = present_edges(options, at_undone, prior.keyframes)
+    return Aligned(errors, undone, _solve_with_prior(undone, errors.sensitivity, present, NO_EDGES, rest))
+
+
+def _plausible(options: StraighteningOptions, aligned: Aligned) -> bool:
+    """Return True if no keyframe turns by more than its rotation may err, by drift along the whole path and by the calibration."""
+    path_m = np.linalg.norm(np.diff(aligned.undone[:, :3, 3], axis=0), axis=1).sum()
+    variance = np.radians(options.rotation_drift_deg) ** 2 * path_m + (aligned.errors.sensitivity[:, 3:] ** 2).sum(axis=(1, 2))
+    return bool((_angles(aligned.undone, aligned.solved.poses) <= PLAUSIBLE * np.sqrt(variance)).all())
+
+
+def _angles(before: F64, after: F64) -> F64:
+    """Return the angles (k,), in rad, between poses (k, 4, 4)."""
+    cosine = 0.5 * (np.einsum("kij,kij->k", before[:, :3, :3], after[:, :3, :3]) - 1.0)
+    return np.asarray(np.arccos(np.clip(cosine, -1.0, 1.0)))
 
 
 def _solve_with_prior(before: F64, sensitivity: F64, present: Edges, closing: Edges, prior: ManhattanPrior | None) -> Solved:

@@ -85,6 +85,13 @@ def with_shared_points(map, visits):
     return map
 
 
+def with_sensitivity(map, turns, parameter=0):
+    """The map whose keyframes an error of one σ of a parameter turns by `turns` (k, 3), in their own frames."""
+    sensitivity = np.zeros((KEYFRAMES, 6, CALIBRATION))
+    sensitivity[:, 3:, parameter] = turns
+    return dataclasses.replace(map, keyframes=map.keyframes.updated(np.arange(KEYFRAMES), sensitivity=sensitivity))
+
+
 def frame():
     depth = np.zeros((CAMERA.height, CAMERA.width), np.float32)
     return Frame(KEYFRAMES - 1, (KEYFRAMES - 1) * 33_000_000, np.zeros((*depth.shape, 3), np.uint8), depth, CAMERA)
@@ -136,14 +143,33 @@ def test_a_turn_that_the_calibration_explains_is_undone_though_it_is_no_drift():
     """The map turns by 3°, six times its plausible drift: left alone, unless a wrong calibration would have turned it alike."""
     map, truth = corridor(np.radians([0.0, 3.0, 0.0]))
     assert PlanesLoop()(map, frame()) is None
-    sensitivity = np.zeros((KEYFRAMES, 6, CALIBRATION))
-    sensitivity[:, 3:, 0] = [log_so3(R.T @ truth) / 1.5 for R in map.keyframes.column("T_world_camera")[:, :3, :3]]  # as an error of 1.5 σ
-    explained = dataclasses.replace(map, keyframes=map.keyframes.updated(np.arange(KEYFRAMES), sensitivity=sensitivity))
+    turns = np.array([log_so3(R.T @ truth) / 1.5 for R in map.keyframes.column("T_world_camera")[:, :3, :3]])  # as an error of 1.5 σ
+    explained = with_sensitivity(map, turns)
     moved = apply_correction(explained, PlanesLoop()(explained, frame()))
     assert errors_deg(moved.keyframes.column("T_world_camera")[:, :3, :3], truth).max() < 0.5
     left = moved.keyframes.column("sensitivity")[:, 3:, 0]
-    assert np.linalg.norm(left[-1]) < 0.2 * np.linalg.norm(sensitivity[-1, 3:, 0])
+    assert np.linalg.norm(left[-1]) < 0.2 * np.linalg.norm(turns[-1])
     np.testing.assert_array_equal(moved.keyframes.column("T_world_camera")[0], map.keyframes.column("T_world_camera")[0])
+
+
+def test_keyframes_that_drifted_beyond_the_reach_of_an_axis_are_aligned_with_those_before():
+    """The map turns by 8° on its way, so that the walls of its ends are off all axes by more than 2°, and a calibration would have turned it alike."""
+    map, truth = corridor(np.radians([0.0, 8.0, 0.0]))
+    drift = np.array([log_so3(R.T @ truth) for R in map.keyframes.column("T_world_camera")[:, :3, :3]])
+    map = with_sensitivity(map, drift / 1.5)
+    moved = apply_correction(map, PlanesLoop()(map, frame()))
+    before, after = (errors_deg(m.keyframes.column("T_world_camera")[:, :3, :3], truth) for m in (map, moved))
+    print(f"rotation off by {before.max():.3f}° at most, {after.max():.3f}° when straight")
+    assert before.max() > 7.9 and after.max() < 0.1
+
+
+def test_a_turn_is_plausible_by_the_error_of_the_calibration():
+    """The map turns by 2°, more than drift may; a calibration may turn every keyframe by 1°, though not alike."""
+    map, truth = corridor(np.radians([0.0, 2.0, 0.0]))
+    assert PlanesLoop()(map, frame()) is None
+    uncertain = with_sensitivity(map, np.outer((-1.0) ** np.arange(KEYFRAMES), np.radians([0.0, 1.0, 0.0])))
+    moved = apply_correction(uncertain, PlanesLoop()(uncertain, frame()))
+    assert errors_deg(moved.keyframes.column("T_world_camera")[:, :3, :3], truth).max() < 2.0 / 3.0
 
 
 def test_a_closed_loop_leaves_no_error_of_the_calibration_where_it_closes():
