@@ -153,7 +153,7 @@ def test_a_turn_that_the_calibration_explains_is_undone_though_it_is_no_drift():
 
 
 def test_keyframes_that_drifted_beyond_the_reach_of_an_axis_are_aligned_with_those_before():
-    """The map turns by 8° on its way, so that the walls of its ends are off all axes by more than 2°, and a calibration would have turned it alike."""
+    """The map turns by 8° on its way, so that walls at its ends are off all axes by more than 2°, and a calibration would have turned it alike."""
     map, truth = corridor(np.radians([0.0, 8.0, 0.0]))
     drift = np.array([log_so3(R.T @ truth) for R in map.keyframes.column("T_world_camera")[:, :3, :3]])
     map = with_sensitivity(map, drift / 1.5)
