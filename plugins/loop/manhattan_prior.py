@@ -34,7 +34,7 @@ from trihedron.plugins.shared.pose_optimizer import PoseSolution
 
 LINKS = 3  # further keyframes each is connected to, so that a stretch that was observed often stays stiff
 UNKNOWN = 1e-6  # 1/m², information of the position of a direction: none
-PLAUSIBLE = 3.0  # standard deviations of a keyframe's rotation that the prior may correct; beyond, the directions are those of another wing
+PLAUSIBLE = 3.0  # standard deviations of the drift that the prior may correct; beyond, the directions are those of another wing
 WALLS = 60  # planes, those observed most often, from which the axes are estimated
 MAX_COS, LARGEST_COS = 0.05, 0.2  # of two walls at right angles, see `perpendicular_pair`
 WALL_SIGMA, EDGE_SIGMA = np.radians(0.3), np.radians(0.5)  # of walls and edges about the axes: no building is exactly Manhattan
@@ -171,15 +171,19 @@ def align_with_manhattan(options: StraighteningOptions, map: Map, camera: Camera
     """Rotate every keyframe back to the Manhattan frame of the map; None without one, or where the newest would hardly rotate.
 
     What the calibration explains is undone first (`calibration_turn`); keyframes up to the row `since` have been aligned before. The rest is drift,
-    and is left alone where some keyframe would turn by more than is plausible by drift and by what is left of the calibration."""
+    and is left alone where some keyframe would turn by more than is plausible for drift. Further passes count while they are plausible."""
     prior = estimate_manhattan_prior(map, camera)
     if prior is None:
         return None
     aligned = _align(options, map, prior, since)
-    for _ in range(PASSES - 1):
-        prior = _prior_near(prior.R_world_manhattan, prior.keyframes, prior.directions, aligned.solved.poses)
-        aligned = _align(options, map, prior, since)
-    solved = aligned.solved if _plausible(options, aligned) else Solved(aligned.undone, aligned.errors.sensitivity)
+    plausible = _plausible(options, aligned)
+    for _ in range(PASSES - 1 if plausible else 0):
+        nearer = _prior_near(prior.R_world_manhattan, prior.keyframes, prior.directions, aligned.solved.poses)
+        further = _align(options, map, nearer, since)
+        if not _plausible(options, further):
+            break
+        aligned = further
+    solved = aligned.solved if plausible else Solved(aligned.undone, aligned.errors.sensitivity)
     before = prior.directions.poses
     if _angles(before, solved.poses)[-1] < np.radians(options.straighten_deg):
         return None
@@ -219,10 +223,9 @@ def _align(options: StraighteningOptions, map: Map, prior: ManhattanPrior, since
 
 
 def _plausible(options: StraighteningOptions, aligned: Aligned) -> bool:
-    """Return True if no keyframe turns by more than its rotation may err, by drift along the whole path and by the calibration."""
+    """Return True if no keyframe turns by more than drift along the whole path would turn it, once the calibration is undone."""
     path_m = np.linalg.norm(np.diff(aligned.undone[:, :3, 3], axis=0), axis=1).sum()
-    variance = np.radians(options.rotation_drift_deg) ** 2 * path_m + (aligned.errors.sensitivity[:, 3:] ** 2).sum(axis=(1, 2))
-    return bool((_angles(aligned.undone, aligned.solved.poses) <= PLAUSIBLE * np.sqrt(variance)).all())
+    return bool(_angles(aligned.undone, aligned.solved.poses).max() <= PLAUSIBLE * np.radians(options.rotation_drift_deg) * np.sqrt(path_m))
 
 
 def _angles(before: F64, after: F64) -> F64:
