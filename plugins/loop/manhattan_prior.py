@@ -162,7 +162,8 @@ def correct_loop(options: CorrectionOptions, map: Map, keyframe: int, found: Pos
     place, newest = np.searchsorted(rows, [keyframe, len(map.keyframes) - 1])
     information = np.asarray(inv(found.covariance), np.float64)[None]
     closing = Edges(np.array([[place, newest]], np.int32), matmul(invert(before[place]), found.T_world_camera)[None], information)
-    solved = _solve_with_prior(before, sensitivity, present_edges(options, map, rows), closing, prior)
+    present = present_edges(options, map, rows, connected_keyframes(options, map, rows))
+    solved = _solve_with_prior(before, sensitivity, present, closing, prior)
     correction = correct_keyframes(map, rows, before, solved.poses)
     return replace(correction, sensitivity=solved.sensitivity, added_covariance=np.zeros((len(rows), 6, 6)))
 
@@ -175,11 +176,12 @@ def align_with_manhattan(options: StraighteningOptions, map: Map, camera: Camera
     prior = estimate_manhattan_prior(map, camera)
     if prior is None:
         return None
-    aligned = _align(options, map, prior, since)
+    pairs = connected_keyframes(options, map, prior.keyframes)
+    aligned = _align(options, map, prior, pairs, since)
     plausible = _plausible(options, aligned)
     for _ in range(PASSES - 1 if plausible else 0):
         nearer = _prior_near(prior.R_world_manhattan, prior.keyframes, prior.directions, aligned.solved.poses)
-        further = _align(options, map, nearer, since)
+        further = _align(options, map, nearer, pairs, since)
         if not _plausible(options, further):
             break
         aligned = further
@@ -209,8 +211,8 @@ class Aligned:
     solved: Solved
 
 
-def _align(options: StraighteningOptions, map: Map, prior: ManhattanPrior, since: int) -> Aligned:
-    """Align the keyframes of the prior with the Manhattan frame, see `align_with_manhattan`."""
+def _align(options: StraighteningOptions, map: Map, prior: ManhattanPrior, pairs: I32, since: int) -> Aligned:
+    """Align the keyframes of the prior, of which `pairs` (e, 2) are connected, with the Manhattan frame, see `align_with_manhattan`."""
     before, sensitivity = map.keyframes.columns_at(prior.keyframes, "T_world_camera", "sensitivity")
     last = max(int(np.searchsorted(prior.keyframes, since, "right")) - 1, 0)
     errors = errors_by_calibration(before, prior.rotations, prior.information, sensitivity, prior.sensitivity, last)
@@ -218,7 +220,7 @@ def _align(options: StraighteningOptions, map: Map, prior: ManhattanPrior, since
     at_undone = replace(map, keyframes=map.keyframes.updated(prior.keyframes, T_world_camera=undone))
     turned = prior.sensitivity + errors.sensitivity[:, 3:] - sensitivity[:, 3:]
     rest = replace(prior, rotations=prior.rotations - errors.xi[:, 3:], sensitivity=turned)
-    present = present_edges(options, at_undone, prior.keyframes)
+    present = present_edges(options, at_undone, prior.keyframes, pairs)
     return Aligned(errors, undone, _solve_with_prior(undone, errors.sensitivity, present, NO_EDGES, rest))
 
 
@@ -261,9 +263,14 @@ def _directions(nodes: F64, prior: ManhattanPrior) -> Edges:
     return Edges(pairs, measured, information)
 
 
-def present_edges(options: CorrectionOptions, map: Map, rows: I32) -> Edges:
-    """Return edges that measure the map as it is: between neighbours in time, and between keyframes of different visits of a place, without which a
-    correction would open the loops that were closed. Their covariance is that of the later keyframe's pose plus the drift along the path."""
+def connected_keyframes(options: CorrectionOptions, map: Map, rows: I32) -> I32:
+    """Return pairs (e, 2) of indices of keyframes `rows`: of neighbours in time, and of keyframes of different visits of a place, without which a
+    correction would open the loops that were closed."""
     neighbours = [np.stack([np.arange(len(rows) - k), np.arange(k, len(rows))], axis=1) for k in range(1, LINKS + 1)]
-    pairs = np.concatenate([*neighbours, revisits(map, rows, options.shared, LINKS)])
-    return Edges(pairs.astype(np.int32), *odometry(options, map, rows[pairs], LINKS))
+    return np.concatenate([*neighbours, revisits(map, rows, options.shared, LINKS)]).astype(np.int32)
+
+
+def present_edges(options: CorrectionOptions, map: Map, rows: I32, pairs: I32) -> Edges:
+    """Return edges that measure the map as it is between pairs (e, 2) of its keyframes `rows`. Their covariance is that of the later keyframe's pose
+    plus the drift along the path."""
+    return Edges(pairs, *odometry(options, map, rows[pairs], LINKS))
