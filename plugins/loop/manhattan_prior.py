@@ -48,30 +48,31 @@ NO_EDGES = Edges(np.zeros((0, 2), np.int32), np.zeros((0, 4, 4)), np.zeros((0, 6
 
 @dataclass(frozen=True)
 class Directions:
-    """Directions of n planes and lines of a map: `vectors` (n, 3) of the world with their information (n, 3, 3), and `turns` (n, 3, 12), by which the
-    calibration turns them in the frames of the keyframes `observers` (n,), each the middle one of those that observed it, at `poses` (k, 4, 4)."""
+    """Directions of n planes and lines of a map with the axes `R_world_manhattan` (3, 3), whose `keyframes` (k,) are at `poses` (k, 4, 4): `vectors`
+    (n, 3) of the world with their information (n, 3, 3), and `turns` (n, 3, 12), by which the calibration turns them in the frames of `observers`
+    (n,), indices of keyframes, each the middle one of those that observed the landmark."""
 
+    R_world_manhattan: F64
+    keyframes: I32
+    poses: F64
     vectors: F64
     information: F64
     turns: F64
     observers: I32
-    poses: F64
 
 
 @dataclass(frozen=True)
 class ManhattanPrior:
-    """`R_world_manhattan` (3, 3), the keyframes' rows (k,) and, for each, phi of `R_world_camera · Exp(phi)` that agrees best with the axes (k, 3)
-    and its information (k, 3, 3), zero about directions that the keyframe's landmarks do not observe. `directions` are those of all landmarks.
+    """For each keyframe of the `directions`, phi of `R_world_camera · Exp(phi)` that agrees best with the axes (k, 3), and its information (k, 3, 3),
+    zero about directions that the keyframe's landmarks do not observe.
 
     `sensitivity` (k, 3, 12) is the derivative by the calibration of the rotation of these landmarks, in the keyframe's frame: they turn with the
     poses that they were placed from, and since the same camera measured them."""
 
-    R_world_manhattan: F64
-    keyframes: I32
+    directions: Directions
     rotations: F64
     information: F64
     sensitivity: F64
-    directions: Directions
 
 
 def estimate_manhattan_prior(map: Map, camera: Camera) -> ManhattanPrior | None:
@@ -95,20 +96,20 @@ def estimate_manhattan_prior(map: Map, camera: Camera) -> ManhattanPrior | None:
     of_planes = plane_turns(coefficients, samples, index_of(seen_by, rows), at_plane, views)
     of_lines = line_turns(ends, index_of(map.lines.rows("observers", lines), rows), at_line, views)
     turns, observers = np.concatenate([of_planes, of_lines]), np.concatenate([at_plane, at_line])
-    return _prior_near(R, rows, Directions(vectors, information, turns, observers, poses), poses)
+    return _prior_near(Directions(R, rows, poses, vectors, information, turns, observers), poses)
 
 
-def _prior_near(R_world_manhattan: F64, keyframes: I32, directions: Directions, expected: F64) -> ManhattanPrior:
+def _prior_near(directions: Directions, expected: F64) -> ManhattanPrior:
     """The prior by those directions that are near an axis once the keyframes are at the `expected` poses (k, 4, 4), and turn with them."""
     turned = matmul(expected[:, :3, :3], np.swapaxes(directions.poses[:, :3, :3], 1, 2))
     with_keyframe = turned[directions.observers]
     vectors = matmul(with_keyframe, directions.vectors[..., None])[..., 0]
     information = matmul(with_keyframe, directions.information, np.swapaxes(with_keyframe, 1, 2))
     phi, information, sensitivity = keyframe_rotations(
-        vectors, information, directions.turns, directions.observers, R_world_manhattan, expected, np.cos(REACH), GATE
+        vectors, information, directions.turns, directions.observers, directions.R_world_manhattan, expected, np.cos(REACH), GATE
     )
     R = matmul(np.swapaxes(directions.poses[:, :3, :3], 1, 2), expected[:, :3, :3], np.array([exp_so3(x) for x in phi]))
-    return ManhattanPrior(R_world_manhattan, keyframes, np.array([log_so3(x) for x in R]), information, sensitivity, directions)
+    return ManhattanPrior(directions, np.array([log_so3(x) for x in R]), information, sensitivity)
 
 
 def _middle_observers(landmarks: Table, keyframes: I32) -> tuple[I32, I32]:
@@ -176,20 +177,19 @@ def align_with_manhattan(options: StraighteningOptions, map: Map, camera: Camera
     prior = estimate_manhattan_prior(map, camera)
     if prior is None:
         return None
-    pairs = connected_keyframes(options, map, prior.keyframes)
+    keyframes, before = prior.directions.keyframes, prior.directions.poses
+    pairs = connected_keyframes(options, map, keyframes)
     aligned = _align(options, map, prior, pairs, since)
     plausible = _plausible(options, aligned)
     for _ in range(PASSES - 1 if plausible else 0):
-        nearer = _prior_near(prior.R_world_manhattan, prior.keyframes, prior.directions, aligned.solved.poses)
-        further = _align(options, map, nearer, pairs, since)
+        further = _align(options, map, _prior_near(prior.directions, aligned.solved.poses), pairs, since)
         if not _plausible(options, further):
             break
         aligned = further
     solved = aligned.solved if plausible else Solved(aligned.undone, aligned.errors.sensitivity)
-    before = prior.directions.poses
     if _angles(before, solved.poses)[-1] < np.radians(options.straighten_deg):
         return None
-    correction = correct_keyframes(map, prior.keyframes, before, solved.poses)
+    correction = correct_keyframes(map, keyframes, before, solved.poses)
     return replace(correction, sensitivity=solved.sensitivity, added_covariance=aligned.errors.covariance)
 
 
@@ -213,14 +213,15 @@ class Aligned:
 
 def _align(options: StraighteningOptions, map: Map, prior: ManhattanPrior, pairs: I32, since: int) -> Aligned:
     """Align the keyframes of the prior, of which `pairs` (e, 2) are connected, with the Manhattan frame, see `align_with_manhattan`."""
-    before, sensitivity = map.keyframes.columns_at(prior.keyframes, "T_world_camera", "sensitivity")
-    last = max(int(np.searchsorted(prior.keyframes, since, "right")) - 1, 0)
+    keyframes, before = prior.directions.keyframes, prior.directions.poses
+    sensitivity = map.keyframes.rows("sensitivity", keyframes)
+    last = max(int(np.searchsorted(keyframes, since, "right")) - 1, 0)
     errors = errors_by_calibration(before, prior.rotations, prior.information, sensitivity, prior.sensitivity, last)
     undone = matmul(before, np.array([exp_se3(x) for x in errors.xi]))
-    at_undone = replace(map, keyframes=map.keyframes.updated(prior.keyframes, T_world_camera=undone))
+    at_undone = replace(map, keyframes=map.keyframes.updated(keyframes, T_world_camera=undone))
     turned = prior.sensitivity + errors.sensitivity[:, 3:] - sensitivity[:, 3:]
     rest = replace(prior, rotations=prior.rotations - errors.xi[:, 3:], sensitivity=turned)
-    present = present_edges(options, at_undone, prior.keyframes, pairs)
+    present = present_edges(options, at_undone, keyframes, pairs)
     return Aligned(errors, undone, _solve_with_prior(undone, errors.sensitivity, present, NO_EDGES, rest))
 
 
@@ -243,7 +244,7 @@ def _solve_with_prior(before: F64, sensitivity: F64, present: Edges, closing: Ed
     count, edges = len(before), concatenate_edges(present, closing)
     differences = np.concatenate([np.zeros((len(present.pairs), *sensitivity.shape[1:])), edge_errors(before, closing, sensitivity)])
     if prior is not None:
-        axes = pose_matrix(prior.R_world_manhattan, np.zeros(3))
+        axes = pose_matrix(prior.directions.R_world_manhattan, np.zeros(3))
         before, sensitivity = np.concatenate([before, axes[None]]), np.concatenate([sensitivity, np.zeros_like(sensitivity[:1])])
         edges = concatenate_edges(edges, _directions(before, prior))
         differences = np.concatenate([differences, np.pad(prior.sensitivity, ((0, 0), (3, 0), (0, 0)))])
