@@ -12,7 +12,7 @@ from typing import Protocol
 import numpy as np
 
 from trihedron.pipeline.core.geometry import invert, pose_matrix
-from trihedron.pipeline.core.lie import exp_se3, exp_so3, log_so3
+from trihedron.pipeline.core.lie import exp_se3, exp_so3
 from trihedron.pipeline.core.linalg import inv, inv_symmetric, matmul
 from trihedron.pipeline.core.types import F64, I32, Camera, Correction, Map, Table
 from trihedron.plugins.loop.calibration_turn import CalibrationErrors, errors_by_calibration
@@ -21,6 +21,7 @@ from trihedron.plugins.loop.manhattan_prior_kernels import Views, keyframe_rotat
 from trihedron.plugins.mapping.covisibility_graph import DriftOptions, current_submap, keyframes_of, odometry, revisits
 from trihedron.plugins.mapping.landmarks import index_of
 from trihedron.plugins.shared.calibration_error import calibration_scales
+from trihedron.plugins.shared.lie_kernels import log_so3_each
 from trihedron.plugins.shared.manhattan_frames_kernels import (
     Walls,
     area_on_axes,
@@ -109,7 +110,7 @@ def _prior_near(directions: Directions, expected: F64) -> ManhattanPrior:
         vectors, information, directions.turns, directions.observers, directions.R_world_manhattan, expected, np.cos(REACH), GATE
     )
     R = matmul(np.swapaxes(directions.poses[:, :3, :3], 1, 2), expected[:, :3, :3], np.array([exp_so3(x) for x in phi]))
-    return ManhattanPrior(directions, np.array([log_so3(x) for x in R]), information, sensitivity)
+    return ManhattanPrior(directions, log_so3_each(R), information, sensitivity)
 
 
 def _middle_observers(landmarks: Table, keyframes: I32) -> tuple[I32, I32]:
