@@ -538,6 +538,9 @@ KEYFRAMES = Columns(
         "covariance": ("f8", (6, 6), Finite()),
         "world_covariance": ("f8", (6, 6), Finite()),
         "sensitivity": ("f8", (6, CALIBRATION), Finite()),
+        "aligned": ("f8", (6,), Finite()),
+        "undone": ("f8", (6,), Finite()),
+        "undone_sensitivity": ("f8", (6, CALIBRATION), Finite()),
         "twist": ("f8", (6,), Finite()),
         "intrinsics": ("f8", (4,), Finite()),
         "points": ("i4", (2,), IndexInto(".point_observations+")),
@@ -618,9 +621,10 @@ class Map(Value):
 
     `revision` counts versions, `loop_closed` is that of the last one with a correction by `loop` or a merged sub-map; a row of `point_observations`
     and its siblings is a keyframe (row), a landmark, and its measurement. A row of `proposals` is a frame of one sub-map that was recognised in an
-    older one: its pose relative to a keyframe of each, and the sum of both covariances (camera frame). Several that agree merge the two."""
+    older one: its pose relative to a keyframe of each, and the sum of both covariances (camera frame). Several that agree merge the two.
+    `calibration_information` and `calibration_score` are those of the newest keyframe's pose."""
 
-    version: ClassVar[int] = 8
+    version: ClassVar[int] = 9
     revision: int
     keyframes: Annotated[Table, KEYFRAMES]
     points: Annotated[Table, POINTS]
@@ -631,6 +635,10 @@ class Map(Value):
     plane_observations: Annotated[Table, PLANE_OBSERVATIONS]
     loop_closed: int = 0
     proposals: Annotated[Table, PROPOSALS] = field(default_factory=_no_proposals)
+    calibration_information: Annotated[F64, Shape(CALIBRATION, CALIBRATION), Finite()] = field(
+        default_factory=lambda: np.zeros((CALIBRATION, CALIBRATION))
+    )
+    calibration_score: Annotated[F64, Shape(CALIBRATION), Finite()] = field(default_factory=lambda: np.zeros(CALIBRATION))
 
     @cached_property
     def memo(self) -> dict[Hashable, Any]:
@@ -663,10 +671,10 @@ class Map(Value):
 class Correction(Value):
     """New poses of keyframes and positions of landmarks, by id, from bundle adjustment or loop closing of revision `based_on`. `*_information`
     (world, 1/m²; of each end of a line) and `plane_covariance`, of (a, b, d), replace those of the map: no measurement is counted twice.
-    `sensitivity` is that of the corrected keyframes to the calibration, and `added_covariance` what their poses are more uncertain by; both are of no
-    keyframe where these stay as they are."""
+    `sensitivity`, `aligned`, `undone` and `undone_sensitivity` replace these columns of the corrected keyframes (`mapping.landmarks`); they are
+    of no keyframe where these stay as they are."""
 
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
 
     based_on: int
     keyframe_ids: Annotated[I32, Shape("k"), IndexInto("map.keyframes")]
@@ -681,7 +689,11 @@ class Correction(Value):
     coefficients: Annotated[F64, Shape("p", 4), UnitNormals()]
     plane_covariance: Annotated[F64, Shape("p", 3, 3)]
     sensitivity: Annotated[F64, Shape("s", 6, CALIBRATION), Finite()] = field(default_factory=lambda: np.zeros((0, 6, CALIBRATION)), kw_only=True)
-    added_covariance: Annotated[F64, Shape("s", 6, 6), Finite()] = field(default_factory=lambda: np.zeros((0, 6, 6)), kw_only=True)
+    aligned: Annotated[F64, Shape("u", 6), Finite()] = field(default_factory=lambda: np.zeros((0, 6)), kw_only=True)
+    undone: Annotated[F64, Shape("u", 6), Finite()] = field(default_factory=lambda: np.zeros((0, 6)), kw_only=True)
+    undone_sensitivity: Annotated[F64, Shape("u", 6, CALIBRATION), Finite()] = field(
+        default_factory=lambda: np.zeros((0, 6, CALIBRATION)), kw_only=True
+    )
 
 
 PLACES = Columns({"keyframe": ("i4", (), IndexInto("map.keyframes")), "descriptor": ("f4", (None,), Finite())})

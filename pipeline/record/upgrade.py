@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from google.protobuf.message import DecodeError
 from mcap_protobuf.schema import build_file_descriptor_set
 
 from trihedron.pipeline.core.constraints import Columns
@@ -53,12 +52,14 @@ ADDED_FIELDS: dict[tuple[str, int], dict[str, Any]] = {  # type and older versio
     ("Pose", 10): {"plane_offsets": np.zeros(3)},
     ("Tracks", 1): {"repeated": 0.0},
     ("Map", 5): {"loop_closed": 0},
+    ("Correction", 2): {"aligned": np.zeros((0, 6))},  # in the place of a field that there is no more
     ("Building", 1): {"doubts": np.zeros((0, 3))},
 }
 # likewise -> the columns of keyframes that it lacks, each a copy of the column `covariance`, or zeros of this shape wherever that changes
 ADDED_COLUMNS: dict[tuple[str, int], dict[str, tuple[int, ...] | None]] = {
     ("Map", 4): {"world_covariance": None},
     ("Map", 6): {"sensitivity": (6, CALIBRATION), "twist": (6,)},
+    ("Map", 8): {"aligned": (6,), "undone": (6,), "undone_sensitivity": (6, CALIBRATION)},
 }
 
 # likewise -> the tables that it lacks, empty wherever that type is recorded
@@ -178,8 +179,9 @@ def _rename_fields(data: bytes) -> bytes:
         array.name = fields.get(name, name) + mark + rest
     if older in ADDED_COLUMNS:
         with suppress(Exception):  # a stranger's header, of which the decoder will say what is wrong
+            keyframes = next(array for array in message.arrays if array.name == "keyframes#")
             for column, shape in ADDED_COLUMNS[older].items():
-                _add_keyframe_column(message, column, shape)
+                keyframes.data = _add_keyframe_column(keyframes.data, message.arrays, "keyframes#", column, shape).encode()
     if not added:
         return bytes(message.SerializeToString())
     message.version += 1
@@ -193,18 +195,20 @@ def _rename_fields(data: bytes) -> bytes:
 
 
 def _add_to_message(header: Any, data: bytes) -> bytes:
-    """A message of a schema of its own with the fields and empty tables that its version lacks."""
+    """A message of a schema of its own with the fields, columns and empty tables that its version lacks."""
     older = header.type, header.version
-    if older not in ADDED_TABLES and older not in ADDED_FIELDS:
+    if older not in ADDED_TABLES and older not in ADDED_FIELDS and older not in ADDED_COLUMNS:
         return data
-    with suppress(DecodeError):  # a damaged message, of which the decoder will say so
+    with suppress(Exception):  # a damaged message or a stranger's, of which the decoder will say what is wrong
         message = message_class(header.type).FromString(data)
         message.version += 1
         for name, columns in ADDED_TABLES.get(older, {}).items():
             getattr(message, name).layout = _empty_layout(columns)
         for name, value in ADDED_FIELDS.get(older, {}).items():
             _set_field(message, name, value)
-        return bytes(message.SerializeToString())
+        for column, shape in ADDED_COLUMNS.get(older, {}).items():
+            message.keyframes.layout = _add_keyframe_column(message.keyframes.layout, message.keyframes.arrays, "", column, shape)
+        return _rename_fields(bytes(message.SerializeToString()))  # which may be an older version still
     return data
 
 
@@ -223,22 +227,22 @@ def _empty_layout(columns: Columns) -> str:
     return json.dumps({"size": 0, "back": 0, "schema": {name: [kind, shape, 0.0] for name, (kind, shape, *_) in columns.columns.items()}, "rows": {}})
 
 
-def _add_keyframe_column(message: Any, column: str, shape: tuple[int, ...] | None) -> None:
-    """Add a column to the table of keyframes, or to a change of it: a copy of `covariance`, or zeros of a shape."""
-    arrays = {array.name: array for array in message.arrays}
-    header = json.loads(arrays["keyframes#"].data)
-    if "covariance" not in header["schema"]:
-        return
-    kind, source_shape, step = header["schema"]["covariance"]
-    header["schema"][column] = [kind, source_shape if shape is None else shape, step]
-    if "covariance" in header["rows"]:
+def _add_keyframe_column(layout: str | bytes, arrays: Any, prefix: str, column: str, shape: tuple[int, ...] | None) -> str:
+    """Add a column to the table of keyframes, or to a change of it: a copy of `covariance`, or zeros of a shape. Names of its `arrays` have a prefix.
+    Returns the layout."""
+    header = json.loads(layout)
+    if "covariance" in header["schema"]:
+        kind, source_shape, step = header["schema"]["covariance"]
+        header["schema"][column] = [kind, source_shape if shape is None else shape, step]
+    if "covariance" in header["schema"] and "covariance" in header["rows"]:
         header["rows"][column] = header["rows"]["covariance"]
-        copied, source = message.arrays.add(), arrays["keyframes#covariance"]
+        source = next(array for array in arrays if array.name == f"{prefix}covariance")
+        copied = arrays.add()
         copied.CopyFrom(source)
-        copied.name = f"keyframes#{column}"
+        copied.name = f"{prefix}{column}"
         if shape is not None:
             zeros = np.zeros((source.shape[0], *shape))
             del copied.shape[:]
             copied.shape.extend(zeros.shape)
             copied.encoding, copied.data = "raw", zeros.tobytes()
-    arrays["keyframes#"].data = json.dumps(header).encode()
+    return json.dumps(header)

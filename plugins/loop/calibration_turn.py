@@ -6,61 +6,49 @@ where they turn from keyframe to keyframe as a wrong calibration would turn them
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from trihedron.pipeline.core.lie import adjoint_between
-from trihedron.pipeline.core.linalg import inv, matmul, solve
-from trihedron.pipeline.core.types import CALIBRATION, F64, I32
+from trihedron.pipeline.core.linalg import eigh, matmul, solve
+from trihedron.pipeline.core.types import CALIBRATION, F64
+from trihedron.plugins.shared.pose_graph import Edges, parameter_errors, solve_pose_graph
 
-LEAST_F = 10.0  # of Fisher's test; at most 9.5 of 2400 maps whose directions err at random, together over one to eight keyframes
+LEAST_F = 4.0  # of Fisher's test; more in 8 of 1200 maps that drift as stated and whose directions err at random, alone or in rows of up to eight
+EXCESS = 8.0  # by which the variance of directions is counted: squared errors of estimates are up to 6.6 times what noise explains (five sensors)
+REPEATED = 32.0  # the same of what residuals show; with 16, a fifth of the poses of three simulated cameras is outside 95 %
 
 
 @dataclass(frozen=True)
-class CalibrationErrors:
-    """Errors of k keyframes by the calibration, estimated by their directions."""
+class CalibrationEstimate:
+    """Errors of the calibration, in its units, that have to be undone; zeros where directions show none."""
 
-    xi: F64  # (k, 6) of `T_world_camera · Exp(xi)`, which undoes them
-    sensitivity: F64  # (k, 6, 12) of the keyframes once they are undone
-    covariance: F64  # (k, 6, 6) of xi, by the noise of the directions
-
-
-def errors_by_calibration(poses: F64, rotations: F64, information: F64, sensitivity: F64, turns: F64, since: int) -> CalibrationErrors:
-    """Estimate the errors that the calibration gave to keyframes at `poses` (k, 4, 4) since the first of them; zeros where their directions do not
-    show them. The estimate is linear in the errors, and so are those that it leaves.
-
-    `rotations` (k, 3) agree best with the axes, with `information` (k, 3, 3) and sensitivity `turns` (k, 3, 12), see `ManhattanPrior`; `sensitivity`
-    (k, 6, 12) is that of the poses. Keyframes up to the row `since` may have been corrected before, so that the calibration is estimated separately
-    for them and for the later ones: by least squares with its standard deviations as prior (ridge regression), together with one rotation of all
-    keyframes, the error of the axes. It counts where it explains more than as many parameters would explain of noise (F-test)."""
-    R = poses[:, :3, :3]
-    first, before = (_carried(poses, sensitivity, np.minimum(np.arange(len(poses)), row)) for row in (0, since))
-    errors = np.concatenate([before - first, sensitivity - before], axis=2)  # (k, 6, 24)
-    measured, later = turns - sensitivity[:, 3:], (np.arange(len(poses)) > since)[:, None, None]  # what turns besides the poses
-    observed = errors[:, 3:] + np.concatenate([np.where(later, 0.0, measured), np.where(later, measured, 0.0)], axis=2)
-    turned, W = matmul(R, rotations[..., None])[..., 0], matmul(R, information, np.swapaxes(R, 1, 2))
-    X = np.concatenate([np.broadcast_to(np.eye(3), R.shape), matmul(R, observed)], axis=2)
-    rows, weighted, y = X.reshape(-1, X.shape[2]), matmul(W, X).reshape(-1, X.shape[2]), turned.ravel()
-    H, b, prior = matmul(rows.T, weighted), matmul(weighted.T, y), np.eye(X.shape[2])  # 1 rad is no constraint on the axes
-    x = solve(H + prior, b)
-    residuals = (y - matmul(rows, x)).reshape(-1, 3)
-    total = (turned * matmul(W, turned[..., None])[..., 0]).sum()
-    unexplained = total - matmul(b[:3], solve(H[:3, :3] + np.eye(3), b[:3]))
-    rest = total - matmul(b, x)  # with the prior's part
-    parameters = np.trace(solve(H + prior, H)) - 3.0
-    freedom = 3.0 * _independent(matmul(W, residuals[..., None])[..., 0], residuals) - 3.0 - parameters
-    if freedom <= 0.0 or (unexplained - rest) * freedom < LEAST_F * parameters * rest:
-        return CalibrationErrors(np.zeros((len(poses), 6)), sensitivity, np.zeros((len(poses), 6, 6)))
-    left = np.asarray(inv(H + prior), np.float64)  # share of an error that is left: 1 - (H + prior)⁻¹ H, the prior being 1
-    noise, left = matmul(left, H, left)[3:, 3:], left[3:, 3:]
-    sensitivity = first + matmul(errors, left[:, :CALIBRATION] + left[:, CALIBRATION:])
-    return CalibrationErrors(matmul(errors, x[3:]), sensitivity, matmul(errors, noise, np.swapaxes(errors, 1, 2)))
+    parameters: F64  # (12,)
+    spread: F64  # (12, 12) root of their covariance, symmetric, so that it is near 1 for what nothing shows
 
 
-def _carried(poses: F64, sensitivity: F64, rows: I32) -> F64:
-    """Return the sensitivity (k, 6, 12) of a camera that moves rigidly with keyframe `rows[i]` to keyframe i."""
-    return np.asarray(matmul(adjoint_between(poses, poses[rows]), sensitivity[rows]))
+NO_ESTIMATE = CalibrationEstimate(np.zeros(CALIBRATION), np.eye(CALIBRATION))
+
+
+def estimate_calibration(nodes: F64, edges: Edges, differences: F64, directions: int, information: F64, score: F64) -> CalibrationEstimate:
+    """Estimate the calibration together with the drift of the nodes (n, 4, 4) of a pose graph, of whose edges the last (k,) are `directions` of
+    keyframes. `differences` (e, 6, 12) are, by the calibration, the errors of the nodes between which an edge is, less that of what it measures.
+
+    The standard deviations of the calibration are its prior (ridge regression). The estimate counts where it explains more than as many parameters
+    would explain of noise (F-test), and then together with what residuals show of it, their `information` (12, 12) and `score` (12,)."""
+    edges, unit = replace(edges, information=edges.information / EXCESS), np.eye(CALIBRATION)
+    y, Y = parameter_errors(solve_pose_graph(nodes, edges), edges, differences)
+    weighted = matmul(np.swapaxes(Y, 1, 2), edges.information)
+    shown, by_directions = matmul(weighted, Y).sum(axis=0), -matmul(weighted, y[..., None]).sum(axis=0)[:, 0]
+    estimate = solve(unit + shown, by_directions)
+    explained, parameters = float(matmul(by_directions, estimate)), float(np.trace(solve(unit + shown, shown)))
+    rest = np.einsum("ei,eij,ej->", y, edges.information, y) - explained  # with the prior's part
+    turned = (y + matmul(Y, estimate))[-directions:, 3:]
+    freedom = 3.0 * _independent(matmul(edges.information[-directions:, 3:, 3:], turned[..., None])[..., 0], turned) - 3.0 - parameters
+    if freedom <= 0.0 or explained * freedom <= LEAST_F * parameters * rest:
+        return NO_ESTIMATE
+    known, axes = eigh(unit + shown + information / REPEATED)
+    return CalibrationEstimate(matmul(axes, matmul(axes.T, by_directions + score / REPEATED) / known), matmul(axes / np.sqrt(known), axes.T))
 
 
 def _independent(weighted: F64, residuals: F64) -> float:

@@ -67,7 +67,7 @@ def close_loop(options: LoopOptions, rank: Callable[[Map], Candidates], map: Map
         return correction
     count = len(map.keyframes)
     period = options.straighten << (count // (16 * options.straighten)).bit_length()
-    return None if count % period else align_with_manhattan(options, map, frame.camera, count - 1 - period)
+    return None if count % period else align_with_manhattan(options, map, frame.camera)
 
 
 def _first_verified(options: LoopOptions, map: Map, frame: Frame, candidates: Candidates) -> Correction | None:

@@ -12,14 +12,14 @@ from typing import Protocol
 import numpy as np
 
 from trihedron.pipeline.core.geometry import invert, pose_matrix
-from trihedron.pipeline.core.lie import exp_se3, exp_so3
+from trihedron.pipeline.core.lie import adjoint_between, exp_se3, exp_so3, log_se3
 from trihedron.pipeline.core.linalg import inv, inv_symmetric, matmul
-from trihedron.pipeline.core.types import F64, I32, Camera, Correction, Map, Table
-from trihedron.plugins.loop.calibration_turn import CalibrationErrors, errors_by_calibration
+from trihedron.pipeline.core.types import CALIBRATION, F64, I32, Camera, Correction, Map, Table
+from trihedron.plugins.loop.calibration_turn import CalibrationEstimate, estimate_calibration
 from trihedron.plugins.loop.keyframe_correction import correct_keyframes
 from trihedron.plugins.loop.manhattan_prior_kernels import Views, keyframe_rotations, line_turns, plane_turns
 from trihedron.plugins.mapping.covisibility_graph import DriftOptions, current_submap, keyframes_of, odometry, revisits
-from trihedron.plugins.mapping.landmarks import index_of
+from trihedron.plugins.mapping.landmarks import ALIGNMENT, index_of
 from trihedron.plugins.shared.calibration_error import calibration_scales
 from trihedron.plugins.shared.lie_kernels import log_so3_each
 from trihedron.plugins.shared.manhattan_frames_kernels import (
@@ -158,40 +158,56 @@ class StraighteningOptions(CorrectionOptions, Protocol):
 
 def correct_loop(options: CorrectionOptions, map: Map, keyframe: int, found: PoseSolution, prior: ManhattanPrior | None) -> Correction:
     """Correct the tracked sub-map by a verified loop: the newest keyframe's pose, with its covariance, relative to `keyframe`. The sensitivities
-    become those of the corrected poses; their covariance stays, although most drift is undone."""
+    become those of the corrected poses; their covariance stays, although most drift is undone. Keyframes as they would be without any alignment are
+    corrected by the loop alone."""
     rows = keyframes_of(map, current_submap(map))
-    before, sensitivity = map.keyframes.columns_at(rows, "T_world_camera", "sensitivity")
+    before, sensitivity, moved, undone, taken = map.keyframes.columns_at(rows, "T_world_camera", "sensitivity", *ALIGNMENT)
     place, newest = np.searchsorted(rows, [keyframe, len(map.keyframes) - 1])
     information = np.asarray(inv(found.covariance), np.float64)[None]
     closing = Edges(np.array([[place, newest]], np.int32), matmul(invert(before[place]), found.T_world_camera)[None], information)
     present = present_edges(options, map, rows, connected_keyframes(options, map, rows))
     solved = _solve_with_prior(before, sensitivity, present, closing, prior)
-    correction = correct_keyframes(map, rows, before, solved.poses)
-    return replace(correction, sensitivity=solved.sensitivity, added_covariance=np.zeros((len(rows), 6, 6)))
+    unaligned = np.concatenate([sensitivity + taken, moved[..., None], undone[..., None]], axis=2)
+    looped = _solve_with_prior(before, unaligned, present, closing, None)
+    errors, moved, undone = looped.sensitivity[..., :CALIBRATION], looped.sensitivity[..., CALIBRATION], looped.sensitivity[..., -1]
+    return replace(
+        correct_keyframes(map, rows, before, solved.poses),
+        sensitivity=solved.sensitivity,
+        aligned=moved + _motions(looped.poses, solved.poses),
+        undone=undone,
+        undone_sensitivity=errors - solved.sensitivity,
+    )
 
 
-def align_with_manhattan(options: StraighteningOptions, map: Map, camera: Camera, since: int) -> Correction | None:
+def align_with_manhattan(options: StraighteningOptions, map: Map, camera: Camera) -> Correction | None:
     """Rotate every keyframe back to the Manhattan frame of the map; None without one, or where the newest would hardly rotate.
 
-    What the calibration explains is undone first (`calibration_turn`); keyframes up to the row `since` have been aligned before. The rest is drift,
-    and is left alone where some keyframe would turn by more than is plausible for drift. Further passes count while they are plausible."""
+    What the calibration explains is undone first (`calibration_turn`). The rest is drift, and is left alone where some keyframe would turn by more
+    than is plausible for drift. Further passes count while they are plausible."""
     prior = estimate_manhattan_prior(map, camera)
     if prior is None:
         return None
     keyframes, before = prior.directions.keyframes, prior.directions.poses
     pairs = connected_keyframes(options, map, keyframes)
-    aligned = _align(options, map, prior, pairs, since)
+    aligned = _align(options, map, prior, pairs)
     plausible = _plausible(options, aligned)
     for _ in range(PASSES - 1 if plausible else 0):
-        further = _align(options, map, _prior_near(prior.directions, aligned.solved.poses), pairs, since)
+        further = _align(options, map, _prior_near(prior.directions, aligned.solved.poses), pairs)
         if not _plausible(options, further):
             break
         aligned = further
-    solved = aligned.solved if plausible else Solved(aligned.undone, aligned.errors.sensitivity)
+    solved = aligned.solved if plausible else aligned.undone
     if _angles(before, solved.poses)[-1] < np.radians(options.straighten_deg):
         return None
-    correction = correct_keyframes(map, keyframes, before, solved.poses)
-    return replace(correction, sensitivity=solved.sensitivity, added_covariance=aligned.errors.covariance)
+    calibration = aligned.calibration
+    sensitivity = aligned.common + matmul(solved.sensitivity, calibration.spread)
+    return replace(
+        correct_keyframes(map, keyframes, before, solved.poses),
+        sensitivity=sensitivity,
+        aligned=_motions(aligned.unaligned, solved.poses),
+        undone=matmul(aligned.errors, calibration.parameters),
+        undone_sensitivity=aligned.common + aligned.errors - sensitivity,
+    )
 
 
 @dataclass(frozen=True)
@@ -204,32 +220,67 @@ class Solved:
 
 @dataclass(frozen=True)
 class Aligned:
-    """Keyframes that are aligned with the Manhattan frame: their `errors` by the calibration, their poses (k, 4, 4) once these are `undone`, and what
-    the pose graph makes of them."""
+    """Keyframes that are aligned with the Manhattan frame: as they would be without any alignment, once the errors by the calibration are undone, and
+    as the pose graph makes them. Their sensitivities are to what is not known of the calibration, without those of a `common` motion."""
 
-    errors: CalibrationErrors
-    undone: F64
+    unaligned: F64  # (k, 4, 4)
+    errors: F64  # (k, 6, 12), sensitivity of these
+    common: F64  # (k, 6, 12), sensitivity of a camera that moves rigidly with the first keyframe
+    calibration: CalibrationEstimate
+    undone: Solved
     solved: Solved
 
 
-def _align(options: StraighteningOptions, map: Map, prior: ManhattanPrior, pairs: I32, since: int) -> Aligned:
-    """Align the keyframes of the prior, of which `pairs` (e, 2) are connected, with the Manhattan frame, see `align_with_manhattan`."""
+def _align(options: StraighteningOptions, map: Map, prior: ManhattanPrior, pairs: I32) -> Aligned:
+    """Align the keyframes of the prior, of which `pairs` (e, 2) are connected, with the Manhattan frame, see `align_with_manhattan`.
+
+    The calibration is estimated by the keyframes as they would be if no alignment had been made: those before left little of its errors. What they
+    undid is not undone again."""
     keyframes, before = prior.directions.keyframes, prior.directions.poses
-    sensitivity = map.keyframes.rows("sensitivity", keyframes)
-    last = max(int(np.searchsorted(keyframes, since, "right")) - 1, 0)
-    errors = errors_by_calibration(before, prior.rotations, prior.information, sensitivity, prior.sensitivity, last)
-    undone = matmul(before, np.array([exp_se3(x) for x in errors.xi]))
-    at_undone = replace(map, keyframes=map.keyframes.updated(keyframes, T_world_camera=undone))
-    turned = prior.sensitivity + errors.sensitivity[:, 3:] - sensitivity[:, 3:]
-    rest = replace(prior, rotations=prior.rotations - errors.xi[:, 3:], sensitivity=turned)
-    present = present_edges(options, at_undone, keyframes, pairs)
-    return Aligned(errors, undone, _solve_with_prior(undone, errors.sensitivity, present, NO_EDGES, rest))
+    sensitivity, moved, undone, taken = map.keyframes.columns_at(keyframes, "sensitivity", *ALIGNMENT)
+    common = np.asarray(matmul(adjoint_between(before, before[:1]), sensitivity[0] + taken[0]))
+    errors = sensitivity + taken - common
+    directions = errors[:, 3:] + prior.sensitivity - sensitivity[:, 3:]
+    unaligned = matmul(before, np.array([exp_se3(-xi) for xi in moved]))
+    calibration = _estimate_calibration(options, map, prior, pairs, unaligned, directions)
+    xi = matmul(errors, calibration.parameters) - undone
+    corrected = matmul(before, np.array([exp_se3(x) for x in xi]))
+    rotations = prior.rotations + undone[:, 3:] - matmul(directions, calibration.parameters)
+    rest = replace(prior, rotations=rotations, sensitivity=directions)
+    present = present_edges(options, _moved(map, keyframes, corrected), keyframes, pairs)
+    return Aligned(unaligned, errors, common, calibration, Solved(corrected, errors), _solve_with_prior(corrected, errors, present, NO_EDGES, rest))
+
+
+def _estimate_calibration(
+    options: StraighteningOptions, map: Map, prior: ManhattanPrior, pairs: I32, unaligned: F64, directions: F64
+) -> CalibrationEstimate:
+    """Estimate the calibration by directions, whose derivatives by it are `directions` (k, 3, 12), of keyframes at poses `unaligned` (k, 4, 4). Pairs
+    of different visits are left out: it was in their corrected poses that they agreed."""
+    neighbours = pairs[pairs[:, 1] - pairs[:, 0] <= LINKS]
+    chain = present_edges(options, _moved(map, prior.directions.keyframes, unaligned), prior.directions.keyframes, neighbours)
+    axes = pose_matrix(prior.directions.R_world_manhattan, np.zeros(3))[None]
+    edges = concatenate_edges(chain, _directions(np.concatenate([prior.directions.poses, axes]), prior))
+    differences = np.zeros((len(edges.pairs), 6, CALIBRATION))
+    differences[len(neighbours) :, 3:] = directions
+    nodes = np.concatenate([unaligned, axes])
+    return estimate_calibration(nodes, edges, differences, len(unaligned), map.calibration_information, -map.calibration_score)
+
+
+def _moved(map: Map, keyframes: I32, poses: F64) -> Map:
+    """The map with its keyframes at other poses (k, 4, 4)."""
+    return replace(map, keyframes=map.keyframes.updated(keyframes, T_world_camera=poses))
 
 
 def _plausible(options: StraighteningOptions, aligned: Aligned) -> bool:
     """Return True if no keyframe turns by more than drift along the whole path would turn it, once the calibration is undone."""
-    path_m = np.linalg.norm(np.diff(aligned.undone[:, :3, 3], axis=0), axis=1).sum()
-    return bool(_angles(aligned.undone, aligned.solved.poses).max() <= PLAUSIBLE * np.radians(options.rotation_drift_deg) * np.sqrt(path_m))
+    undone = aligned.undone.poses
+    path_m = np.linalg.norm(np.diff(undone[:, :3, 3], axis=0), axis=1).sum()
+    return bool(_angles(undone, aligned.solved.poses).max() <= PLAUSIBLE * np.radians(options.rotation_drift_deg) * np.sqrt(path_m))
+
+
+def _motions(before: F64, after: F64) -> F64:
+    """Return xi (k, 6) of `before · Exp(xi) = after`, poses (k, 4, 4)."""
+    return np.array([log_se3(T) for T in matmul(invert(before), after)])
 
 
 def _angles(before: F64, after: F64) -> F64:

@@ -13,7 +13,7 @@ from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import F64, I32, Bool, Correction, Map, Table
 from trihedron.plugins.mapping.covisibility_graph import observed_by
 from trihedron.plugins.mapping.landmark_kinds import LINE, PLANE, POINT, LandmarkKind, landmarks_of
-from trihedron.plugins.mapping.landmarks import isin
+from trihedron.plugins.mapping.landmarks import ALIGNMENT, isin
 from trihedron.plugins.mapping.plane_fusion import equivalent_moments, motions_between
 from trihedron.plugins.shared.covariances import transform_plane_covariance
 
@@ -28,8 +28,7 @@ def apply_correction(map: Map, correction: Correction) -> Map:
     ids, poses = correction.keyframe_ids[known], correction.T_world_keyframe[known]
     if len(ids):
         last, later = int(np.argmax(ids)), _later(map, int(ids.max()))
-        if len(correction.sensitivity) == len(known):
-            map = _correct_errors(map, ids, last, later, correction.sensitivity[known], correction.added_covariance[known])
+        map = _correct_errors(map, correction, ids, last, later, known)
         map = _move_culled(map, ids, poses)
         map = _move_later(map, correction, int(ids[last]), later, poses[last])
         map = replace(map, keyframes=map.keyframes.updated(ids, T_world_camera=poses))
@@ -42,17 +41,18 @@ def apply_correction(map: Map, correction: Correction) -> Map:
     return replace(map, points=points, lines=lines, planes=planes)
 
 
-def _correct_errors(map: Map, ids: I32, last: int, later: I32, sensitivity: F64, added: F64) -> Map:
-    """Give keyframes `ids` a new sensitivity (k, 6, 12) to the calibration, and more covariance (k, 6, 6) in the world. The `later` keyframes still
-    differ from the newest of these, `ids[last]`, as they did."""
-    T, old = (map.keyframes.row(name, int(ids[last])) for name in ("T_world_camera", "sensitivity"))
-    poses, own = map.keyframes.columns_at(later, "T_world_camera", "sensitivity")
-    to_later = adjoint_between(poses, T)
-    rows = np.concatenate([ids, later])
-    sensitivity = np.concatenate([sensitivity, own + matmul(to_later, sensitivity[last] - old)])
-    added = np.concatenate([added, matmul(to_later, added[last], np.swapaxes(to_later, 1, 2))])
-    covariance = map.keyframes.rows("world_covariance", rows) + added
-    return replace(map, keyframes=map.keyframes.updated(rows, sensitivity=sensitivity, world_covariance=covariance))
+def _correct_errors(map: Map, correction: Correction, ids: I32, last: int, later: I32, known: Bool) -> Map:
+    """Give keyframes `ids`, those of the correction that are `known`, what it states of their errors. The `later` keyframes still differ from the
+    newest of these, `ids[last]`, as they did."""
+    to_later = adjoint_between(map.keyframes.rows("T_world_camera", later), map.keyframes.row("T_world_camera", int(ids[last])))
+    rows, changed = np.concatenate([ids, later]), dict[str, F64]()
+    for name in ("sensitivity", *ALIGNMENT):
+        given: F64 = getattr(correction, name)
+        if len(given) != len(known):
+            continue
+        new, own, old = given[known], map.keyframes.rows(name, later), map.keyframes.row(name, int(ids[last]))
+        changed[name] = np.concatenate([new, own + matmul(to_later, new[last] - old)])
+    return replace(map, keyframes=map.keyframes.updated(rows, **changed)) if changed else map
 
 
 def _later(map: Map, newest: int) -> I32:

@@ -19,6 +19,7 @@ from trihedron.plugins.mapping.landmark_kinds import LINE, PLANE, POINT, Landmar
 from trihedron.plugins.mapping.landmarks import OBSERVERS
 from trihedron.plugins.mapping.plane_fusion import equivalent_moments, fit_planes, move_moments, project_to_planes
 from trihedron.plugins.mapping.projection import line_terms, parameters_on, plane_terms, point_terms, points_along
+from trihedron.plugins.mapping.reference_keyframe import alignment_of_reference
 from trihedron.plugins.shared.calibration_error import calibration_covariance
 from trihedron.plugins.shared.covariances import point_covariance, propagate_pose_covariance
 from trihedron.plugins.shared.pose_optimizer import classify_terms
@@ -109,6 +110,7 @@ def add_keyframe(map: Map, pose: Pose, camera: Camera) -> tuple[Map, int]:
         covariance=pose.local_covariance[None],
         world_covariance=(pose.covariance - calibration_covariance(pose))[None],
         sensitivity=pose.sensitivity[None],
+        **{name: value[None] for name, value in alignment_of_reference(pose, map).items()},
         twist=pose.twist[None],
         intrinsics=camera.intrinsics[None],
         points=empty,
@@ -117,7 +119,8 @@ def add_keyframe(map: Map, pose: Pose, camera: Camera) -> tuple[Map, int]:
         submap=np.array([pose.submap]),
         alive=np.ones(1, np.bool_),
     )
-    return replace(map, keyframes=table), int(rows[0])
+    evidence = {name: getattr(pose, name) for name in ("calibration_information", "calibration_score")}
+    return replace(map, keyframes=table, **evidence), int(rows[0])
 
 
 def count_visible(map: Map, points: I32, lines: I32, planes: I32) -> Map:

@@ -18,6 +18,9 @@ KEYFRAMES = {
     "covariance": Column("f8", (6, 6)),  # of its pose relative to the landmarks near it, see types
     "world_covariance": Column("f8", (6, 6)),  # of its pose in the world, by drift
     "sensitivity": Column("f8", (6, CALIBRATION)),  # of its pose's error to the calibration, see `shared.calibration_error`
+    "aligned": Column("f8", (6,)),  # xi by which alignments with the Manhattan frame have moved it: without them, `T_world_camera · Exp(-xi)`
+    "undone": Column("f8", (6,)),  # the part of this that undid errors by the calibration
+    "undone_sensitivity": Column("f8", (6, CALIBRATION)),  # what they have taken off its sensitivity
     "twist": Column("f8", (6,)),  # velocity of the camera (m/s, rad/s), in its frame
     "intrinsics": Column("f8", (4,)),  # fx, fy, cx, cy
     "points": Column("i4", (2,)),  # its rows of the observation tables, half open
@@ -26,6 +29,7 @@ KEYFRAMES = {
     "submap": Column("i4"),  # poses of different sub-maps are in different worlds
     "alive": Column("?"),
 }
+ALIGNMENT = "aligned", "undone", "undone_sensitivity"  # what a new keyframe has from its reference keyframe
 
 
 def point_columns(descriptor_bytes: int) -> dict[str, Column]:

@@ -16,6 +16,7 @@ from trihedron.pipeline.core.lie import adjoint
 from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import F64, Map, Pose, Rotation
 from trihedron.plugins.mapping.covisibility_graph import keyframes_of
+from trihedron.plugins.mapping.landmarks import ALIGNMENT, KEYFRAMES
 from trihedron.plugins.shared.calibration_error import calibration_covariance
 
 UNMOVED = 1e-12  # rad and m: rounding; a keyframe that moved by less leaves the pose unchanged
@@ -42,9 +43,21 @@ def with_relative_sensitivity(pose: Pose, map: Map) -> Pose:
     return replace(pose, relative_sensitivity=pose.sensitivity - _reference_sensitivity(pose, map))
 
 
+def alignment_of_reference(pose: Pose, map: Map) -> dict[str, F64]:
+    """Return what alignments with the Manhattan frame have done to a keyframe at the pose, its columns `ALIGNMENT`: the same as to the reference
+    keyframe that it moves rigidly with, and nothing without one."""
+    known = 0 <= pose.reference < len(map.keyframes)
+    return {name: _carried(pose, map, name) if known else np.zeros(KEYFRAMES[name].shape) for name in ALIGNMENT}
+
+
 def _reference_sensitivity(pose: Pose, map: Map) -> F64:
     """The sensitivity (6, 12) to the calibration of a camera that moves rigidly with the pose's reference keyframe."""
-    return np.asarray(matmul(adjoint(invert(pose.T_reference_camera)), map.keyframes.row("sensitivity", pose.reference)))
+    return _carried(pose, map, "sensitivity")
+
+
+def _carried(pose: Pose, map: Map, name: str) -> F64:
+    """A column (6,) or (6, m) of the reference keyframe, of xi in its frame, for a camera that moves with it."""
+    return np.asarray(matmul(adjoint(invert(pose.T_reference_camera)), map.keyframes.row(name, pose.reference)))
 
 
 def transform_rotation_to_map(previous: Rotation, pose: Pose | None, map: Map | None) -> tuple[Rotation, Pose | None]:

@@ -114,6 +114,15 @@ def remaining_errors(poses: F64, edges: Edges, errors: F64, differences: F64) ->
     return np.asarray(errors + moved)
 
 
+def parameter_errors(poses: F64, edges: Edges, differences: F64) -> tuple[F64, F64]:
+    """Return the errors (e, 6) of the edges and their derivatives (e, 6, m) by parameters by which edges and poses err, once the graph is solved for
+    the poses again (variable projection; Golub and Pereyra, 1973). `poses` (n, 4, 4) solve it now; `differences` as in `remaining_errors`."""
+    error, J_a, J_b = _linearised(poses, edges)
+    a, b = edges.pairs.T
+    moved = remaining_errors(poses, edges, np.zeros((len(poses), 6, differences.shape[2])), differences)
+    return error, np.asarray(differences + matmul(J_a, moved[a]) + matmul(J_b, moved[b]))
+
+
 def _linearised(poses: F64, edges: Edges) -> tuple[F64, F64, F64]:
     """Errors (e, 6) of the edges, and their derivatives (e, 6, 6) by xi of nodes a and b."""
     a, b = edges.pairs.T

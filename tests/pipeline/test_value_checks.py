@@ -75,6 +75,7 @@ ATTACKS = [  # topic, change, stage to compute again, message after the place
      f"the field 'T_world_camera' is not a rotation with a translation; {DAMAGED}"),
     ("map", column_of("points", "first", 2**24), "pose", f"the field 'points' has a column 'first' that names row {2**24} of keyframes"),
     ("map", column_of("point_observations", "point", -1), "pose", "the field 'point_observations' has a column 'point' that names row -1 of points"),
+    ("map", with_number("calibration_score", np.nan), "pose", f"the field 'calibration_score' is not finite; {DAMAGED}"),
     ("map", lambda value: replace(value, points=value.lines), "pose", "the field 'points' has no column 'position_m' of float64[3]"),
     ("rotation", with_number("R_world_camera", np.nan), "pose", f"the field 'R_world_camera' is not a rotation; {DAMAGED}"),
     ("frames", lambda value: replace(value, camera=replace(value.camera, fx=0.0)), "pose",

@@ -4,24 +4,27 @@ import numpy as np
 import pytest
 
 from trihedron.pipeline.core.geometry import invert, pose_matrix
-from trihedron.pipeline.core.lie import adjoint, exp_so3
+from trihedron.pipeline.core.lie import exp_so3
 from trihedron.pipeline.core.types import CALIBRATION
-from trihedron.plugins.loop.calibration_turn import errors_by_calibration
+from trihedron.plugins.loop import calibration_turn
+from trihedron.plugins.loop.calibration_turn import estimate_calibration
+from trihedron.plugins.shared.pose_graph import Edges
 
 COUNT = 48
 SIGMA = np.radians(0.4)  # of the directions of a keyframe
-INFORMATION = np.broadcast_to(np.eye(3) / SIGMA**2, (COUNT, 3, 3))
+DRIFT = np.radians(0.05)  # of a keyframe relative to the one before
 FOCAL, THETA = 0.003, 1.4  # standard deviation of the focal length, and its error in these
+FIRST = np.eye(CALIBRATION)[0]
 
 
 def walk():
-    """Poses (k, 4, 4) of a camera that looks round one and a half times as it walks, and their sensitivity (k, 6, 12): the focal length turns it by
-    its share of the turn, the registration of depth tips it a little."""
+    """Poses (k, 4, 4) of a camera that looks round one and a half times as it walks, and the derivatives (k, 3, 12) of their rotations: the focal
+    length turns it by its share of the turn, the registration of depth tips it a little."""
     yaw = np.linspace(0.0, 3.0 * np.pi, COUNT)
     poses = np.array([pose_matrix(exp_so3(np.array([0.0, a, 0.0])), np.array([0.2 * i, 0.0, np.sin(a)])) for i, a in enumerate(yaw)])
-    sensitivity = np.zeros((COUNT, 6, CALIBRATION))
-    sensitivity[:, 4, 0], sensitivity[:, 0, 0], sensitivity[:, 3, 5] = FOCAL * yaw, 0.002 * yaw, 1e-4 * np.sin(yaw)
-    return poses, sensitivity
+    turns = np.zeros((COUNT, 3, CALIBRATION))
+    turns[:, 1, 0], turns[:, 0, 5] = FOCAL * yaw, 1e-4 * np.sin(yaw)
+    return poses, turns
 
 
 def noise(seed, together=1):
@@ -29,88 +32,95 @@ def noise(seed, together=1):
     return SIGMA * np.repeat(np.random.default_rng(seed).normal(size=(COUNT // together, 3)), together, axis=0)
 
 
-def angles_deg(xi):
-    return np.degrees(np.linalg.norm(xi[:, 3:], axis=1))
+def drift(seed):
+    """Errors (k, 3) of the poses: a random walk."""
+    steps = DRIFT * np.random.default_rng(1000 + seed).normal(size=(COUNT, 3))
+    return np.cumsum(steps, axis=0) - steps[0]
 
 
-def test_a_wrong_focal_length_is_undone():
-    poses, sensitivity = walk()
-    truth = THETA * sensitivity[:, :, 0]
-    xi = errors_by_calibration(poses, truth[:, 3:] + noise(0), INFORMATION, sensitivity, sensitivity[:, 3:], 0).xi
-    assert angles_deg(truth).max() > 2.0 and angles_deg(xi - truth).max() < 0.25
-    assert np.abs(xi - truth)[:, :3].max() < 0.1 * np.abs(truth[:, :3]).max()  # the position moves with the rotation
+def estimate(rotations, turns, seen=True, information=None, score=None):
+    """The estimate by directions that turn by `rotations` (k, 3) from keyframe to keyframe, with derivatives `turns` (k, 3, 12), and what residuals
+    show, by default nothing."""
+    poses, _ = walk()
+    pairs = np.stack([np.arange(COUNT - 1), np.arange(1, COUNT)], axis=1)
+    chain = Edges(pairs, invert(poses[:-1]) @ poses[1:], np.tile(np.diag(np.repeat([1e4, DRIFT**-2], 3)), (COUNT - 1, 1, 1)))
+    pairs = np.stack([np.full(COUNT, COUNT), np.arange(COUNT)], axis=1)
+    measured = poses @ np.array([pose_matrix(exp_so3(phi), np.zeros(3)) for phi in rotations])
+    direction = np.diag(np.repeat([1e-6, SIGMA**-2 if seen else 0.0], 3))
+    edges = Edges(
+        np.concatenate([chain.pairs, pairs]),
+        np.concatenate([chain.measured, measured]),
+        np.concatenate([chain.information, np.tile(direction, (COUNT, 1, 1))]),
+    )
+    differences = np.pad(turns, ((COUNT - 1, 0), (3, 0), (0, 0)))
+    information = np.zeros((CALIBRATION, CALIBRATION)) if information is None else information
+    score = np.zeros(CALIBRATION) if score is None else score
+    return estimate_calibration(np.concatenate([poses, np.eye(4)[None]]), edges, differences, COUNT, information, score)
 
 
-def test_what_is_undone_is_no_error_by_the_calibration_any_more():
-    """The sensitivity that is left, times the error of the calibration, is the error that is left; without directions it stays."""
-    poses, sensitivity = walk()
-    theta = THETA * np.eye(CALIBRATION)[0]
-    truth = sensitivity @ theta
-    undone = errors_by_calibration(poses, truth[:, 3:], INFORMATION, sensitivity, sensitivity[:, 3:], 0)
-    remaining = undone.sensitivity @ theta
-    assert truth - undone.xi == pytest.approx(remaining, abs=1e-9) and np.abs(remaining).max() < 0.1 * np.abs(truth).max()
-    assert undone.sensitivity[:, 3, 5] == pytest.approx(sensitivity[:, 3, 5], rel=0.5, abs=1e-5)  # what the directions hardly show stays
-    nothing = errors_by_calibration(poses, 0.0 * truth[:, 3:], INFORMATION, sensitivity, sensitivity[:, 3:], 0)
-    assert np.array_equal(nothing.sensitivity, sensitivity) and not nothing.covariance.any()
+def test_a_wrong_focal_length_is_estimated():
+    _, turns = walk()
+    found = estimate(turns @ (THETA * FIRST) + noise(0), turns)
+    sigma = np.sqrt((found.spread[0] ** 2).sum())
+    print(f"{found.parameters[0]:.2f} ± {sigma:.2f} σ")
+    assert sigma < 0.7 and abs(found.parameters[0] - THETA) < sigma
+    assert np.abs(found.parameters[1:]).max() < 0.3 and found.spread[5, 5] > 0.9  # what the directions hardly show stays as unknown as it was
 
 
-def test_the_covariance_is_that_of_what_is_undone():
-    """Over 200 maps whose directions err at random: the scatter of xi is its stated covariance."""
-    poses, sensitivity = walk()
-    truth = THETA * sensitivity[:, 3:, 0]
-    undone = [errors_by_calibration(poses, truth + noise(seed), INFORMATION, sensitivity, sensitivity[:, 3:], 0) for seed in range(200)]
-    scatter = np.array([one.xi[-1, 4] for one in undone]).std()
-    assert scatter == pytest.approx(np.sqrt(undone[0].covariance[-1, 4, 4]), rel=0.15)
+def test_the_spread_is_that_of_the_errors(monkeypatch):
+    """Over 300 maps that drift, with calibrations as their prior has them: where the noise is counted once, the errors of the estimates are as large
+    as stated."""
+    monkeypatch.setattr(calibration_turn, "EXCESS", 1.0)
+    _, turns = walk()
+    turns[:, 2, 11] = np.radians(1.0) * np.sin(np.linspace(0.0, 20.0, COUNT))
+    squared = []
+    for seed in range(300):
+        theta = np.random.default_rng(5000 + seed).normal(size=CALIBRATION)
+        found = estimate(turns @ theta + noise(seed) + drift(seed), turns)
+        squared.append(((np.linalg.solve(found.spread, found.parameters - theta)) ** 2)[[0, 11]])
+    assert np.mean(squared, axis=0) == pytest.approx(1.0, abs=0.25)
 
 
-def test_a_common_rotation_of_the_axes_moves_nothing():
-    poses, sensitivity = walk()
+def test_a_common_rotation_of_the_axes_shows_nothing():
+    poses, turns = walk()
     common = np.radians([0.3, -0.8, 0.5])
-    xi = errors_by_calibration(poses, np.swapaxes(poses[:, :3, :3], 1, 2) @ common + noise(1), INFORMATION, sensitivity, sensitivity[:, 3:], 0).xi
-    assert not xi.any()
+    assert not estimate(np.swapaxes(poses[:, :3, :3], 1, 2) @ common + noise(1), turns).parameters.any()
 
 
-def test_what_was_aligned_before_stays_and_the_rest_follows():
-    poses, sensitivity = walk()
-    since = 24
-    carried = adjoint(invert(poses[since:]) @ poses[since]) @ sensitivity[since]
-    truth = np.zeros((COUNT, 6))
-    truth[since:] = THETA * (sensitivity[since:] - carried)[:, :, 0]
-    xi = errors_by_calibration(poses, truth[:, 3:] + noise(2), INFORMATION, sensitivity, sensitivity[:, 3:], since).xi
-    assert angles_deg(truth).max() > 0.9 and angles_deg(xi - truth).max() < 0.3
-
-
-def test_errors_of_the_directions_tell_of_the_calibration_and_are_not_followed():
-    """Directions that the calibration turns where it moves no pose, as a rolling shutter tilts vertical edges while the camera walks: no keyframe is
-    turned after them, and they count as what they are."""
-    poses, sensitivity = walk()
-    turns = sensitivity[:, 3:].copy()
+def test_errors_of_the_directions_tell_of_the_calibration():
+    """Directions that the calibration turns where it moves no pose, as a rolling shutter tilts vertical edges while the camera walks."""
+    _, turns = walk()
     turns[:, 0, 11] = np.radians(1.0) * np.sin(np.linspace(0.0, 20.0, COUNT))
-    theta = np.zeros(CALIBRATION)
-    theta[[0, 11]] = THETA, 1.5
-    xi = errors_by_calibration(poses, turns @ theta + noise(2), INFORMATION, sensitivity, turns, 0).xi
-    truth = sensitivity @ theta
-    assert angles_deg(xi - truth).max() < 0.25
-    wrong = errors_by_calibration(poses, turns @ theta + noise(2), INFORMATION, sensitivity, sensitivity[:, 3:], 0).xi
-    assert angles_deg(wrong - truth).max() > angles_deg(xi - truth).max()
+    theta = THETA * FIRST
+    theta[11] = 1.5
+    found = estimate(turns @ theta + noise(2), turns)
+    sigma = np.sqrt((found.spread**2).sum(axis=1))[[0, 11]]
+    assert sigma.max() < 0.7 and (np.abs(found.parameters - theta)[[0, 11]] < sigma).all()
+
+
+def test_what_residuals_show_is_counted_where_directions_show_the_calibration():
+    """Residuals know the registration of depth, which directions hardly show; alone they move no map."""
+    _, turns = walk()
+    information, score = np.zeros((CALIBRATION, CALIBRATION)), np.zeros(CALIBRATION)
+    information[5, 5], score[5] = 3200.0, 3200.0 * -1.2
+    found = estimate(turns @ (THETA * FIRST) + noise(0), turns, information=information, score=score)
+    assert found.parameters[5] == pytest.approx(-1.2, abs=0.05) and found.spread[5, 5] < 0.15
+    assert found.parameters[0] == pytest.approx(THETA, abs=0.6)
+    alone = estimate(noise(0), turns, information=information, score=score)
+    assert not alone.parameters.any() and np.array_equal(alone.spread, np.eye(CALIBRATION))
 
 
 @pytest.mark.parametrize("together", [1, 4, 8])
-def test_directions_that_err_hardly_ever_turn_the_map(together):
+def test_directions_that_err_hardly_ever_show_a_calibration(together):
     """One map in fifty at most, whether errors are independent or those of walls that several keyframes in a row see."""
-    poses, sensitivity = walk()
-    turns = sensitivity[:, 3:]
-    moved = [
-        errors_by_calibration(poses, noise(seed, together), INFORMATION, sensitivity, turns, since).xi.any()
-        for seed in range(50)
-        for since in (0, 24)
-    ]
-    assert sum(moved) <= 2
+    _, turns = walk()
+    shown = [estimate(noise(seed, together) + drift(seed), turns).parameters.any() for seed in range(100)]
+    assert sum(shown) <= 2
 
 
-def test_an_exact_calibration_explains_nothing():
-    poses, sensitivity = walk()
-    drift = np.radians(2.0) * np.linspace(0.0, 1.0, COUNT)[:, None] * [0.0, 1.0, 0.0]
-    assert not errors_by_calibration(poses, drift, INFORMATION, np.zeros_like(sensitivity), np.zeros_like(sensitivity[:, 3:]), 0).xi.any()
-    unseen = np.zeros((COUNT, 3, 3))  # nor do keyframes without directions
-    assert not errors_by_calibration(poses, drift, unseen, sensitivity, sensitivity[:, 3:], 0).xi.any()
+def test_what_turns_nothing_explains_nothing():
+    _, turns = walk()
+    turned = np.radians(2.0) * np.linspace(0.0, 1.0, COUNT)[:, None] * [0.0, 1.0, 0.0]
+    exact = estimate(turned, np.zeros_like(turns))
+    assert not exact.parameters.any() and np.array_equal(exact.spread, np.eye(CALIBRATION))
+    assert not estimate(turned, turns, seen=False).parameters.any()  # nor do keyframes without directions

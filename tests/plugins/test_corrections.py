@@ -14,11 +14,13 @@ from trihedron.pipeline.core.types import CALIBRATION
 from trihedron.plugins.mapping import plane_fusion
 from trihedron.plugins.mapping.correction import apply_correction
 from trihedron.plugins.mapping.covisibility_graph import local_window, observed_by
+from trihedron.plugins.mapping.insertion import add_keyframe
 from trihedron.plugins.mapping.landmark_kinds import LINE, POINT
+from trihedron.plugins.mapping.landmarks import ALIGNMENT, KEYFRAMES
 
 sys.path.insert(0, str(Path(__file__).parent))
 from landmark_world import World, camera_at
-from map_steps import EVERY, correction, step, walk
+from map_steps import EVERY, correction, pose_of, step, walk
 
 
 @pytest.mark.parametrize("wire", ["bundle", "loop"])
@@ -81,24 +83,41 @@ def test_what_came_after_the_corrected_keyframes_moves_with_them():
 
 
 def test_errors_by_the_calibration_are_corrected_with_the_keyframes():
-    """A correction of keyframes 0 to 2 takes half of their errors, with some noise, and arrives when keyframe 3 exists: that errs as keyframe 2,
-    carried there, and by what it differed from that before. A correction that names no errors leaves them."""
+    """A correction of keyframes 0 to 2 takes half of their errors, and arrives when keyframe 3 exists: that errs as keyframe 2, carried there, and by
+    what it differed from that before. So do the columns of alignments. A correction that names no errors leaves them."""
     map = walk(World(), 4, stride=6)
-    sensitivity = np.random.default_rng(0).normal(size=(4, 6, CALIBRATION))
-    map = dataclasses.replace(map, keyframes=map.keyframes.updated(np.arange(4), sensitivity=sensitivity))
+    rng = np.random.default_rng(0)
+    before = {name: rng.normal(size=(4, *KEYFRAMES[name].shape)) for name in ("sensitivity", *ALIGNMENT)}
+    map = dataclasses.replace(map, keyframes=map.keyframes.updated(np.arange(4), **before))
     poses = map.keyframes.column("T_world_camera")
     moved = correction(map, keyframe_ids=np.array([2, 0, 1], np.int32), T_world_keyframe=poses[[2, 0, 1]])
-    added = np.tile(0.01 * np.eye(6), (3, 1, 1))
-    half = dataclasses.replace(moved, sensitivity=0.5 * sensitivity[[2, 0, 1]], added_covariance=added)
+    half = dataclasses.replace(moved, **{name: 0.5 * value[[2, 0, 1]] for name, value in before.items()})
     to_last = adjoint(invert(poses[3]) @ poses[2])
-    before, after = map.keyframes.column("world_covariance"), apply_correction(map, half).keyframes
-    assert after.column("sensitivity")[:3] == pytest.approx(0.5 * sensitivity[:3])
-    assert after.column("sensitivity")[3] == pytest.approx(sensitivity[3] - 0.5 * to_last @ sensitivity[2])
-    assert after.column("world_covariance")[:3] == pytest.approx(before[:3] + added)
-    assert after.column("world_covariance")[3] == pytest.approx(before[3] + 0.01 * to_last @ to_last.T)
-    assert np.array_equal(apply_correction(map, moved).keyframes.column("sensitivity"), sensitivity)
-    stranger = dataclasses.replace(moved, sensitivity=sensitivity, added_covariance=np.zeros((4, 6, 6)))  # of four keyframes, for three
-    assert np.array_equal(apply_correction(map, stranger).keyframes.column("sensitivity"), sensitivity)
+    after = apply_correction(map, half).keyframes
+    for name, value in before.items():
+        assert after.column(name)[:3] == pytest.approx(0.5 * value[:3])
+        assert after.column(name)[3] == pytest.approx(value[3] - 0.5 * to_last @ value[2])
+    stranger = dataclasses.replace(moved, sensitivity=before["sensitivity"])  # of four keyframes, for three
+    for unchanged in (moved, stranger):
+        assert all(np.array_equal(apply_correction(map, unchanged).keyframes.column(name), value) for name, value in before.items())
+
+
+def test_a_new_keyframe_was_aligned_as_its_reference_keyframe():
+    """It moves with that, so that its errors would, too, if nothing had been undone; the first keyframe has no reference."""
+    world = World()
+    map = walk(world, 2, stride=6)
+    assert not any(map.keyframes.column(name).any() for name in ALIGNMENT)
+    rng = np.random.default_rng(0)
+    before = {name: rng.normal(size=(2, *KEYFRAMES[name].shape)) for name in ALIGNMENT}
+    map = dataclasses.replace(map, keyframes=map.keyframes.updated(np.arange(2), **before))
+    T = camera_at(12.0)
+    to_newest = adjoint(invert(T) @ map.keyframes.row("T_world_camera", 1))
+    pose = dataclasses.replace(pose_of(T, 2), reference=1, T_reference_camera=invert(map.keyframes.row("T_world_camera", 1)) @ T)
+    evidence = {"calibration_information": np.diag(np.arange(CALIBRATION, dtype=np.float64)), "calibration_score": np.ones(CALIBRATION)}
+    grown = add_keyframe(map, dataclasses.replace(pose, **evidence), world.frame(2).camera)[0]
+    assert all(np.array_equal(getattr(grown, name), value) for name, value in evidence.items())
+    after = grown.keyframes
+    assert all(after.column(name)[2] == pytest.approx(to_newest @ before[name][1]) for name in ALIGNMENT)
 
 
 def test_keyframes_that_others_make_redundant_are_retired():

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from trihedron.pipeline.core.geometry import invert, pose_matrix, transform_planes
-from trihedron.pipeline.core.lie import exp_so3, log_se3, log_so3
+from trihedron.pipeline.core.lie import adjoint, exp_se3, exp_so3, log_se3, log_so3
 from trihedron.pipeline.core.types import CALIBRATION, Camera, Frame, Pose
 from trihedron.plugins.loop import manhattan_prior
 from trihedron.plugins.loop.appearance import AppearanceLoop
+from trihedron.plugins.loop.keyframe_correction import correct_keyframes
 from trihedron.plugins.loop.manhattan_prior import correct_loop, estimate_manhattan_prior
 from trihedron.plugins.loop.planes import PlanesLoop
 from trihedron.plugins.mapping import plane_fusion
@@ -153,6 +154,34 @@ def test_a_turn_that_the_calibration_explains_is_undone_though_it_is_no_drift():
     np.testing.assert_array_equal(moved.keyframes.column("T_world_camera")[0], map.keyframes.column("T_world_camera")[0])
 
 
+def test_what_was_undone_before_counts_and_is_not_undone_again():
+    """The first half was aligned before, by half of its error by the calibration, and what is left of that counts as nearly nothing: the directions,
+    as they would be without that alignment, show the whole error, and the rest is undone."""
+    map, truth = corridor(np.radians([0.0, 3.0, 0.0]))
+    R = map.keyframes.column("T_world_camera")[:, :3, :3]
+    turns = np.array([log_so3(one.T @ truth) / 1.5 for one in R])
+    raw = with_sensitivity(map, turns)
+    before, sensitivity = raw.keyframes.columns_at(np.arange(KEYFRAMES), "T_world_camera", "sensitivity")
+    last = KEYFRAMES // 2
+    undone, taken = np.zeros((KEYFRAMES, 6)), 0.95 * sensitivity
+    undone[:, 3:] = 0.75 * turns
+    after = before @ np.array([pose_matrix(exp_so3(xi), np.zeros(3)) for xi in undone[:, 3:]])
+    after[last:] = after[last] @ invert(before[last]) @ before[last:]  # the second half follows the last of the first
+    to_later = adjoint(invert(before[last:]) @ before[last])
+    undone[last:], taken[last:] = to_later @ undone[last], to_later @ taken[last]
+    columns = {"sensitivity": sensitivity - taken, "aligned": undone, "undone": undone, "undone_sensitivity": taken}
+    every = np.arange(KEYFRAMES, dtype=np.int32)
+    moved = apply_correction(raw, dataclasses.replace(correct_keyframes(raw, every, before, after), **columns))
+    aligned = PlanesLoop()(moved, frame())
+    assert errors_deg(moved.keyframes.column("T_world_camera")[:, :3, :3], truth).max() > 1.4
+    assert errors_deg(aligned.T_world_keyframe[:, :3, :3], truth).max() < 0.5
+    assert aligned.undone[:, 3:] == pytest.approx(1.5 * turns, abs=np.radians(0.3))
+    assert aligned.undone_sensitivity + aligned.sensitivity == pytest.approx(raw.keyframes.column("sensitivity"), abs=1e-4)
+    without = aligned.T_world_keyframe @ np.array([exp_se3(-xi) for xi in aligned.aligned])
+    assert errors_deg(without[:, :3, :3], truth) == pytest.approx(errors_deg(R, truth), abs=1e-6)
+    assert PlanesLoop()(apply_correction(moved, aligned), frame()) is None  # nothing is left to be undone
+
+
 def test_keyframes_that_drifted_beyond_the_reach_of_an_axis_are_aligned_with_those_before():
     """The map turns by 8° on its way, so that walls at its ends are off all axes by more than 2°, and a calibration would have turned it alike."""
     map, truth = corridor(np.radians([0.0, 8.0, 0.0]))
@@ -170,6 +199,28 @@ def test_a_pass_that_reaches_another_wing_is_not_taken(monkeypatch):
     aligned = PlanesLoop()(map, frame())
     monkeypatch.setattr(manhattan_prior, "PASSES", 1)
     np.testing.assert_array_equal(aligned.T_world_keyframe, PlanesLoop()(map, frame()).T_world_keyframe)
+
+
+def test_a_loop_corrects_keyframes_as_they_would_be_without_alignment():
+    """A map that was aligned, and the same one that was not: closed by the same loop, what the first would be without that is the second."""
+    raw, _ = corridor(DRIFT)
+    every = np.arange(KEYFRAMES, dtype=np.int32)
+    before = raw.keyframes.column("T_world_camera")
+    undone = np.zeros((KEYFRAMES, 6))
+    undone[:, 1], undone[:, 5] = 0.02 * np.linspace(0.0, 1.0, KEYFRAMES) ** 2, np.radians(0.3) * np.linspace(0.0, 1.0, KEYFRAMES)
+    columns = {"aligned": undone, "undone": undone, "undone_sensitivity": np.zeros((KEYFRAMES, 6, CALIBRATION))}
+    columns["undone_sensitivity"][:, :, 2] = undone / 1.5
+    moved = before @ np.array([exp_se3(xi) for xi in undone])
+    aligned = apply_correction(raw, dataclasses.replace(correct_keyframes(raw, every, before, moved), **columns))
+    T, none = before[-1] @ exp_se3(np.array([0.03, -0.05, 0.02, 0.003, 0.004, -0.005])), np.empty(0, np.uint8)
+    found = PoseSolution(T, 1e-8 * np.eye(6), np.empty((6, 0)), none, none, none, 0.0)
+    closed, expected = (correct_loop(PlanesLoop(), map, 0, found, None) for map in (aligned, raw))
+    without = closed.T_world_keyframe @ np.array([exp_se3(-xi) for xi in closed.aligned])
+    assert np.abs(invert(moved) @ closed.T_world_keyframe - np.eye(4)).max() > 0.03
+    assert without == pytest.approx(expected.T_world_keyframe, abs=5e-4)
+    assert closed.undone == pytest.approx(1.5 * (closed.sensitivity + closed.undone_sensitivity)[:, :, 2], abs=1e-9)
+    assert np.abs(closed.undone[-1]).max() < 1e-3 * np.abs(undone[-1]).max()
+    assert expected.aligned == pytest.approx(0.0, abs=1e-12) and not expected.undone.any()
 
 
 def test_a_closed_loop_leaves_no_error_of_the_calibration_where_it_closes():

@@ -30,6 +30,7 @@ def map():
     keyframes, _ = made.keyframes.appended(
         index=np.arange(n) * 5, stamp_ns=np.arange(n), T_world_camera=poses, covariance=np.tile(COVARIANCE, (n, 1, 1)),
         world_covariance=np.tile(COVARIANCE, (n, 1, 1)), sensitivity=np.zeros((n, 6, CALIBRATION)), twist=np.zeros((n, 6)),
+        aligned=np.zeros((n, 6)), undone=np.zeros((n, 6)), undone_sensitivity=np.zeros((n, 6, CALIBRATION)),
         intrinsics=np.ones((n, 4)), points=np.zeros((n, 2)), lines=np.zeros((n, 2)), planes=np.zeros((n, 2)),
         submap=np.array([0] * len(OLDER) + [1] * len(NEWER)), alive=np.ones(n, np.bool_),
     )  # fmt: skip

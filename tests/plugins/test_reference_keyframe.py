@@ -28,6 +28,7 @@ def map_with(*poses):
     keyframes, _ = map.keyframes.appended(
         index=np.arange(n), stamp_ns=np.arange(n), T_world_camera=np.array(poses), covariance=np.tile(np.eye(6), (n, 1, 1)),
         world_covariance=np.tile(np.eye(6), (n, 1, 1)), sensitivity=np.zeros((n, 6, CALIBRATION)), twist=np.zeros((n, 6)),
+        aligned=np.zeros((n, 6)), undone=np.zeros((n, 6)), undone_sensitivity=np.zeros((n, 6, CALIBRATION)),
         intrinsics=np.ones((n, 4)), submap=np.zeros(n), points=empty, lines=empty, planes=empty, alive=np.ones(n, np.bool_),
     )  # fmt: skip
     assert set(KEYFRAMES) == set(keyframes.schema)
