@@ -12,7 +12,7 @@ import numpy as np
 
 from trihedron.pipeline.core.linalg import eigh, matmul, solve
 from trihedron.pipeline.core.types import CALIBRATION, F64
-from trihedron.plugins.shared.pose_graph import Edges, parameter_errors, solve_pose_graph
+from trihedron.plugins.shared.pose_graph import Edges, parameter_errors
 
 LEAST_F = 4.0  # of Fisher's test; more in 8 of 1200 maps that drift as stated and whose directions err at random, alone or in rows of up to eight
 EXCESS = 8.0  # by which the variance of directions is counted: squared errors of estimates are up to 6.6 times what noise explains (five sensors)
@@ -37,7 +37,7 @@ def estimate_calibration(nodes: F64, edges: Edges, differences: F64, directions:
     The standard deviations of the calibration are its prior (ridge regression). The estimate counts where it explains more than as many parameters
     would explain of noise (F-test), and then together with what residuals show of it, their `information` (12, 12) and `score` (12,)."""
     edges, unit = replace(edges, information=edges.information / EXCESS), np.eye(CALIBRATION)
-    y, Y = parameter_errors(solve_pose_graph(nodes, edges), edges, differences)
+    y, Y = parameter_errors(nodes, edges, differences)
     weighted = matmul(np.swapaxes(Y, 1, 2), edges.information)
     shown, by_directions = matmul(weighted, Y).sum(axis=0), -matmul(weighted, y[..., None]).sum(axis=0)[:, 0]
     estimate = solve(unit + shown, by_directions)

@@ -115,12 +115,14 @@ def remaining_errors(poses: F64, edges: Edges, errors: F64, differences: F64) ->
 
 
 def parameter_errors(poses: F64, edges: Edges, differences: F64) -> tuple[F64, F64]:
-    """Return the errors (e, 6) of the edges and their derivatives (e, 6, m) by parameters by which edges and poses err, once the graph is solved for
-    the poses again (variable projection; Golub and Pereyra, 1973). `poses` (n, 4, 4) solve it now; `differences` as in `remaining_errors`."""
+    """Return the errors (e, 6) of the edges and their derivatives (e, 6, m) by parameters by which edges and poses err, both with the poses (n, 4, 4)
+    that make the errors least, to first order (variable projection; Golub and Pereyra, 1973). `differences` are as in `remaining_errors`."""
     error, J_a, J_b = _linearised(poses, edges)
     a, b = edges.pairs.T
-    moved = remaining_errors(poses, edges, np.zeros((len(poses), 6, differences.shape[2])), differences)
-    return error, np.asarray(differences + matmul(J_a, moved[a]) + matmul(J_b, moved[b]))
+    both = np.concatenate([differences, error[..., None]], axis=2)
+    moved = remaining_errors(poses, edges, np.zeros((len(poses), 6, both.shape[2])), both)
+    left = both + matmul(J_a, moved[a]) + matmul(J_b, moved[b])
+    return left[..., -1], left[..., :-1]
 
 
 def _linearised(poses: F64, edges: Edges) -> tuple[F64, F64, F64]:
