@@ -189,24 +189,24 @@ def align_with_manhattan(options: StraighteningOptions, map: Map, camera: Camera
         return None
     keyframes, before = prior.directions.keyframes, prior.directions.poses
     pairs = connected_keyframes(options, map, keyframes)
-    aligned = _align(options, map, prior, pairs)
+    unaligned = _unaligned(options, map, keyframes, pairs)
+    aligned = _align(options, map, prior, pairs, unaligned)
     plausible = _plausible(options, aligned)
     for _ in range(PASSES - 1 if plausible else 0):
-        further = _align(options, map, _prior_near(prior.directions, aligned.solved.poses), pairs)
+        further = _align(options, map, _prior_near(prior.directions, aligned.solved.poses), pairs, unaligned)
         if not _plausible(options, further):
             break
         aligned = further
     solved = aligned.solved if plausible else aligned.undone
     if _angles(before, solved.poses)[-1] < np.radians(options.straighten_deg):
         return None
-    calibration = aligned.calibration
-    sensitivity = aligned.common + matmul(solved.sensitivity, calibration.spread)
+    sensitivity = unaligned.common + matmul(solved.sensitivity, aligned.calibration.spread)
     return replace(
         correct_keyframes(map, keyframes, before, solved.poses),
         sensitivity=sensitivity,
-        aligned=_motions(aligned.unaligned, solved.poses),
-        undone=matmul(aligned.errors, calibration.parameters),
-        undone_sensitivity=aligned.common + aligned.errors - sensitivity,
+        aligned=_motions(unaligned.poses, solved.poses),
+        undone=matmul(unaligned.errors, aligned.calibration.parameters),
+        undone_sensitivity=unaligned.common + unaligned.errors - sensitivity,
     )
 
 
@@ -219,51 +219,59 @@ class Solved:
 
 
 @dataclass(frozen=True)
-class Aligned:
-    """Keyframes that are aligned with the Manhattan frame: as they would be without any alignment, once the errors by the calibration are undone, and
-    as the pose graph makes them. Their sensitivities are to what is not known of the calibration, without those of a `common` motion."""
+class Unaligned:
+    """Keyframes as they would be without any alignment, and their sensitivities: that of a `common` motion with the first of them, and the rest."""
 
-    unaligned: F64  # (k, 4, 4)
-    errors: F64  # (k, 6, 12), sensitivity of these
-    common: F64  # (k, 6, 12), sensitivity of a camera that moves rigidly with the first keyframe
+    poses: F64  # (k, 4, 4)
+    errors: F64  # (k, 6, 12)
+    common: F64  # (k, 6, 12)
+    chain: Edges  # between keyframes that follow each other
+
+
+def _unaligned(options: StraighteningOptions, map: Map, keyframes: I32, pairs: I32) -> Unaligned:
+    """Return keyframes, of which `pairs` (e, 2) are connected, as they would be without any alignment. Pairs of different visits are left out: it was
+    in their corrected poses that they agreed."""
+    before, sensitivity, moved, _, taken = map.keyframes.columns_at(keyframes, "T_world_camera", "sensitivity", *ALIGNMENT)
+    common = np.asarray(matmul(adjoint_between(before, before[:1]), sensitivity[0] + taken[0]))
+    poses = matmul(before, np.array([exp_se3(-xi) for xi in moved]))
+    chain = present_edges(options, _moved(map, keyframes, poses), keyframes, pairs[pairs[:, 1] - pairs[:, 0] <= LINKS])
+    return Unaligned(poses, sensitivity + taken - common, common, chain)
+
+
+@dataclass(frozen=True)
+class Aligned:
+    """Keyframes that are aligned with the Manhattan frame: once the errors by the calibration are undone, and as the pose graph makes them. Their
+    sensitivities are to what is not known of the calibration."""
+
     calibration: CalibrationEstimate
     undone: Solved
     solved: Solved
 
 
-def _align(options: StraighteningOptions, map: Map, prior: ManhattanPrior, pairs: I32) -> Aligned:
+def _align(options: StraighteningOptions, map: Map, prior: ManhattanPrior, pairs: I32, unaligned: Unaligned) -> Aligned:
     """Align the keyframes of the prior, of which `pairs` (e, 2) are connected, with the Manhattan frame, see `align_with_manhattan`.
 
-    The calibration is estimated by the keyframes as they would be if no alignment had been made: those before left little of its errors. What they
-    undid is not undone again."""
-    keyframes, before = prior.directions.keyframes, prior.directions.poses
-    sensitivity, moved, undone, taken = map.keyframes.columns_at(keyframes, "sensitivity", *ALIGNMENT)
-    common = np.asarray(matmul(adjoint_between(before, before[:1]), sensitivity[0] + taken[0]))
-    errors = sensitivity + taken - common
+    The calibration is estimated by the `unaligned` keyframes: alignments before left little of its errors. What they undid is not undone again."""
+    keyframes, before, errors = prior.directions.keyframes, prior.directions.poses, unaligned.errors
+    sensitivity, undone = map.keyframes.columns_at(keyframes, "sensitivity", "undone")
     directions = errors[:, 3:] + prior.sensitivity - sensitivity[:, 3:]
-    unaligned = matmul(before, np.array([exp_se3(-xi) for xi in moved]))
-    calibration = _estimate_calibration(options, map, prior, pairs, unaligned, directions)
+    calibration = _estimate_calibration(map, prior, unaligned, directions)
     xi = matmul(errors, calibration.parameters) - undone
     corrected = matmul(before, np.array([exp_se3(x) for x in xi]))
     rotations = prior.rotations + undone[:, 3:] - matmul(directions, calibration.parameters)
     rest = replace(prior, rotations=rotations, sensitivity=directions)
     present = present_edges(options, _moved(map, keyframes, corrected), keyframes, pairs)
-    return Aligned(unaligned, errors, common, calibration, Solved(corrected, errors), _solve_with_prior(corrected, errors, present, NO_EDGES, rest))
+    return Aligned(calibration, Solved(corrected, errors), _solve_with_prior(corrected, errors, present, NO_EDGES, rest))
 
 
-def _estimate_calibration(
-    options: StraighteningOptions, map: Map, prior: ManhattanPrior, pairs: I32, unaligned: F64, directions: F64
-) -> CalibrationEstimate:
-    """Estimate the calibration by directions, whose derivatives by it are `directions` (k, 3, 12), of keyframes at poses `unaligned` (k, 4, 4). Pairs
-    of different visits are left out: it was in their corrected poses that they agreed."""
-    neighbours = pairs[pairs[:, 1] - pairs[:, 0] <= LINKS]
-    chain = present_edges(options, _moved(map, prior.directions.keyframes, unaligned), prior.directions.keyframes, neighbours)
+def _estimate_calibration(map: Map, prior: ManhattanPrior, unaligned: Unaligned, directions: F64) -> CalibrationEstimate:
+    """Estimate the calibration by directions, whose derivatives by it are `directions` (k, 3, 12), of unaligned keyframes."""
     axes = pose_matrix(prior.directions.R_world_manhattan, np.zeros(3))[None]
-    edges = concatenate_edges(chain, _directions(np.concatenate([prior.directions.poses, axes]), prior))
+    edges = concatenate_edges(unaligned.chain, _directions(np.concatenate([prior.directions.poses, axes]), prior))
     differences = np.zeros((len(edges.pairs), 6, CALIBRATION))
-    differences[len(neighbours) :, 3:] = directions
-    nodes = np.concatenate([unaligned, axes])
-    return estimate_calibration(nodes, edges, differences, len(unaligned), map.calibration_information, -map.calibration_score)
+    differences[len(unaligned.chain.pairs) :, 3:] = directions
+    nodes = np.concatenate([unaligned.poses, axes])
+    return estimate_calibration(nodes, edges, differences, len(unaligned.poses), map.calibration_information, -map.calibration_score)
 
 
 def _moved(map: Map, keyframes: I32, poses: F64) -> Map:

@@ -1,7 +1,6 @@
 """Recordings: what stands first, when chunks close, what a viewer sees, and what a wrong file says."""
 
 import io
-import json
 import struct
 import sys
 import threading
@@ -26,17 +25,14 @@ from trihedron.pipeline.core.errors import RecordingError
 from trihedron.pipeline.core.geometry import rotation_from_quaternion
 from trihedron.pipeline.core.lie import exp_se3, exp_so3
 from trihedron.pipeline.core.table import Column, Table
-from trihedron.pipeline.core.types import CALIBRATION, Correction, FrameReference, ManhattanFrame, Map, Planes, Pose, Segments, Surface, Trajectory
+from trihedron.pipeline.core.types import FrameReference, ManhattanFrame, Map, Planes, Pose, Segments, Surface, Trajectory
 from trihedron.pipeline.record import mcap_writer as module
 from trihedron.pipeline.record.codec import FORMAT, timing_of
 from trihedron.pipeline.record.embedded_images import frame_of, messages_of
 from trihedron.pipeline.record.foxglove import TopicView
 from trihedron.pipeline.record.foxglove_messages import MOST_VERTICES
 from trihedron.pipeline.record.reader import Recording, TopicReader
-from trihedron.pipeline.record.schemas import message_class
 from trihedron.pipeline.record.writer import RecordingWriter
-from trihedron.plugins.mapping.insertion import add_keyframe
-from trihedron.plugins.mapping.landmarks import ALIGNMENT, empty_map
 
 sys.path.insert(0, str(Path(__file__).parent))
 from toys import CAMERA, ToyDataset, ToyKeypoints
@@ -286,75 +282,6 @@ def test_a_recording_of_format_4_is_read_and_upgraded(tmp_path, capsys):
     images = [["/dataset", "trihedron.Frame", "3"], ["/dataset/color", "foxglove.CompressedImage", "3"], ["/dataset/depth", "foxglove.RawImage", "3"]]
     before, after = ([line for line in lines if line not in images] for lines in schemas)
     assert before == after and ["/planes", "trihedron.Planes", "3"] in schemas[1] and ["/timing", "trihedron.Timing", "3"] in schemas[1]
-
-
-def test_a_map_without_what_alignments_did_is_upgraded(tmp_path):
-    """As version 8 of the map was, a snapshot and a change of it: no alignment has done anything to its keyframes."""
-    ours, old, new = (tmp_path / f"{name}.mcap" for name in ("ours", "old", "new"))
-    map, writer = empty_map(0, 0, 32, 32, 4), RecordingWriter(ours, {})
-    for index in range(3):
-        pose = Pose(index, index, np.eye(4), np.eye(6), np.eye(4), -1, np.zeros(3, np.int32), 0, "ok", "")
-        map = replace(add_keyframe(map, pose, CAMERA)[0], index=index, stamp_ns=index, revision=index)
-        writer.write("map", map)
-    writer.close()
-
-    def without(data):
-        message = message_class("Map").FromString(data)
-        layout = json.loads(message.keyframes.layout)
-        for name in ALIGNMENT:
-            layout["schema"].pop(name), layout["rows"].pop(name)
-        kept = [array for array in message.keyframes.arrays if array.name not in ALIGNMENT]
-        assert len(kept) == len(message.keyframes.arrays) - len(ALIGNMENT)
-        del message.keyframes.arrays[:]
-        message.keyframes.arrays.extend(kept)
-        message.keyframes.layout, message.version = json.dumps(layout), 8
-        return message.SerializeToString()
-
-    rewrite(ours, old, "/map", without)
-    with pytest.raises(RecordingError, match="holds Map version 8, this program reads version 9"):
-        list(Recording(old).values("map"))
-    assert main(["convert", str(old), str(new)]) == 0
-    for before, after in zip(Recording(ours).values("map"), Recording(new).values("map"), strict=True):
-        assert before.keyframes.schema == after.keyframes.schema and len(before.keyframes) == before.index + 1
-        assert all(np.array_equal(before.keyframes.column(name), after.keyframes.column(name)) for name in after.keyframes.schema)
-
-
-def test_a_correction_with_a_field_that_there_is_no_more_is_upgraded(tmp_path):
-    """As version 2 was: after the sensitivities came covariances, in the place of which are the motions of keyframes."""
-    ours, old, new = (tmp_path / f"{name}.mcap" for name in ("ours", "old", "new"))
-    none, writer = np.zeros((0, 3, 3)), RecordingWriter(ours, {})
-    ids, bare = np.zeros(0, np.int32), none.astype(np.float32)
-    keyframes = np.zeros(1, np.int32), np.eye(4)[None], np.ones((1, 6, CALIBRATION))
-    lines, planes = (ids, np.zeros((0, 2, 3)), np.zeros((0, 2, 3, 3), np.float32)), (ids, np.zeros((0, 4)), none)
-    writer.write("bundle", Correction(0, 0, 0, *keyframes[:2], ids, np.zeros((0, 3)), bare, *lines, *planes, sensitivity=keyframes[2]))
-    writer.close()
-
-    def with_covariance(data):
-        message = message_class("Correction").FromString(data)
-        message.aligned.shape[:], message.aligned.data, message.version = (1, 6, 6), np.eye(6).tobytes(), 2
-        message.ClearField("undone"), message.ClearField("undone_sensitivity")
-        return message.SerializeToString()
-
-    rewrite(ours, old, "/bundle", with_covariance)
-    assert main(["convert", str(old), str(new)]) == 0
-    (upgraded,) = Recording(new).values("bundle", check=False)
-    assert (upgraded.sensitivity == 1.0).all() and len(upgraded.aligned) == len(upgraded.undone) == len(upgraded.undone_sensitivity) == 0
-
-
-def rewrite(source, destination, topic, change):
-    """Write a copy of a recording in which messages of a topic are changed."""
-    with open(source, "rb") as stream, open(destination, "wb") as out:
-        reader, writer, numbers = make_reader(stream), Writer(out), {}
-        writer.start()
-        for metadata in reader.iter_metadata():
-            writer.add_metadata(metadata.name, metadata.metadata)
-        for schema, channel, message in reader.iter_messages():
-            if channel.topic not in numbers:
-                number = writer.register_schema(schema.name, schema.encoding, schema.data)
-                numbers[channel.topic] = writer.register_channel(channel.topic, channel.message_encoding, number)
-            data = change(message.data) if channel.topic == topic else message.data
-            writer.add_message(numbers[channel.topic], message.log_time, data, message.publish_time)
-        writer.finish()
 
 
 def test_a_large_map_is_shown_more_seldom():

@@ -1,5 +1,7 @@
 """`trihedron convert`: frames and truth survive bit for bit, and every mistake is one line."""
 
+import json
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -10,7 +12,7 @@ import pytest
 from trihedron.pipeline.app.cli import main
 from trihedron.pipeline.core.errors import RecordingError
 from trihedron.pipeline.core.registry import load_plugins, plugin_class
-from trihedron.pipeline.core.types import Building, Pose
+from trihedron.pipeline.core.types import CALIBRATION, Building, Camera, Correction, Pose
 from trihedron.pipeline.record import upgrade
 from trihedron.pipeline.record.codec import FORMAT, Encoder, LegacyMessage
 from trihedron.pipeline.record.mcap_file import McapFile
@@ -19,7 +21,8 @@ from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.schemas import message_class
 from trihedron.pipeline.record.trajectories import read_trajectory
 from trihedron.pipeline.record.writer import RecordingWriter
-from trihedron.plugins.mapping.landmarks import empty_map
+from trihedron.plugins.mapping.insertion import add_keyframe
+from trihedron.plugins.mapping.landmarks import ALIGNMENT, empty_map
 
 CAMERA = "width: 64\nheight: 48\nfx: 50.0\nfy: 50.0\ncx: 31.5\ncy: 23.5\ndepth_scale: 5000\nfps: 30\n"
 COUNT = 12
@@ -175,6 +178,60 @@ def test_a_value_without_a_later_field_is_upgraded(tmp_path, topic, of, older, l
     assert main(["convert", str(before), str(after)]) == 0
     expected, upgraded = (list(Recording(path).values(topic)) for path in (recorded, after))
     assert [Encoder().encode(value) for value in upgraded] == [Encoder().encode(value) for value in expected] and len(upgraded) == 3
+
+
+def test_a_map_without_what_alignments_did_is_upgraded(tmp_path):
+    """As version 8 of the map was, a snapshot and a change of it: no alignment has done anything to its keyframes."""
+    ours, old, new = (tmp_path / f"{name}.mcap" for name in ("ours", "old", "new"))
+    map, writer = empty_map(0, 0, 32, 32, 4), RecordingWriter(ours, {})
+    camera = Camera(64, 48, 50.0, 51.0, 31.5, 23.5)
+    for index in range(3):
+        pose = Pose(index, index, np.eye(4), np.eye(6), np.eye(4), -1, np.zeros(3, np.int32), 0, "ok", "")
+        map = replace(add_keyframe(map, pose, camera)[0], index=index, stamp_ns=index, revision=index)
+        writer.write("map", map)
+    writer.close()
+
+    def without_alignments(data):
+        message = message_class("Map").FromString(data)
+        layout = json.loads(message.keyframes.layout)
+        for name in ALIGNMENT:
+            layout["schema"].pop(name), layout["rows"].pop(name)
+        kept = [array for array in message.keyframes.arrays if array.name not in ALIGNMENT]
+        assert len(kept) == len(message.keyframes.arrays) - len(ALIGNMENT)
+        del message.keyframes.arrays[:]
+        message.keyframes.arrays.extend(kept)
+        message.keyframes.layout, message.version = json.dumps(layout), 8
+        return message.SerializeToString()
+
+    rewrite(ours, old, without_alignments)
+    with pytest.raises(RecordingError, match="holds Map version 8, this program reads version 9"):
+        list(Recording(old).values("map"))
+    assert main(["convert", str(old), str(new)]) == 0
+    for before, after in zip(Recording(ours).values("map"), Recording(new).values("map"), strict=True):
+        assert before.keyframes.schema == after.keyframes.schema and len(before.keyframes) == before.index + 1
+        assert all(np.array_equal(before.keyframes.column(name), after.keyframes.column(name)) for name in after.keyframes.schema)
+
+
+def test_a_correction_with_a_field_that_there_is_no_more_is_upgraded(tmp_path):
+    """As version 2 was: after the sensitivities came covariances, in the place of which are the motions of keyframes."""
+    ours, old, new = (tmp_path / f"{name}.mcap" for name in ("ours", "old", "new"))
+    none, writer = np.zeros((0, 3, 3)), RecordingWriter(ours, {})
+    ids, bare = np.zeros(0, np.int32), none.astype(np.float32)
+    keyframes = np.zeros(1, np.int32), np.eye(4)[None], np.ones((1, 6, CALIBRATION))
+    lines, planes = (ids, np.zeros((0, 2, 3)), np.zeros((0, 2, 3, 3), np.float32)), (ids, np.zeros((0, 4)), none)
+    writer.write("bundle", Correction(0, 0, 0, *keyframes[:2], ids, np.zeros((0, 3)), bare, *lines, *planes, sensitivity=keyframes[2]))
+    writer.close()
+
+    def with_covariance(data):
+        message = message_class("Correction").FromString(data)
+        message.aligned.shape[:], message.aligned.data, message.version = (1, 6, 6), np.eye(6).tobytes(), 2
+        message.ClearField("undone"), message.ClearField("undone_sensitivity")
+        return message.SerializeToString()
+
+    rewrite(ours, old, with_covariance)
+    assert main(["convert", str(old), str(new)]) == 0
+    (upgraded,) = Recording(new).values("bundle", check=False)
+    assert (upgraded.sensitivity == 1.0).all() and len(upgraded.aligned) == len(upgraded.undone) == len(upgraded.undone_sensitivity) == 0
 
 
 def test_counts_of_planes_make_room_for_their_offsets(tmp_path):
