@@ -156,6 +156,7 @@ def line_turns(ends: F64, observers: I32, middle: I32, views: Views) -> F64:
     observer had two samples in its image turns as its middle observer does."""
     turns, p, q = np.zeros((len(ends), 3, CALIBRATION)), np.empty((2, 3)), np.empty((2, 3))
     E, moved, at, camera = np.empty((3, CALIBRATION)), np.empty((3, CALIBRATION)), np.empty(3), views.camera
+    surface = np.full(4, np.nan)
     for i in range(len(ends)):
         T = views.poses[middle[i]]
         R, t = split_pose(T)
@@ -181,8 +182,9 @@ def line_turns(ends: F64, observers: I32, middle: I32, views: Views) -> F64:
             for end in range(2):
                 signed = (weight if end else -weight) / (share * length)
                 add_placed_error(
-                    q[end], p[end], Q, keyframes.errors[k], keyframes.twists[k], camera, views.width, views.height, views.scales, signed, E, moved
-                )
+                    q[end], surface, p[end], Q, keyframes.errors[k], keyframes.twists[k], camera, views.width, views.height, views.scales, signed, E,
+                    moved,
+                )  # fmt: skip
         if total == 0.0:
             turns[i] = views.sensitivities[middle[i], 3:]
         else:

@@ -21,6 +21,7 @@ from trihedron.plugins.shared.calibration_error import CALIBRATION_NAMES, calibr
 from trihedron.plugins.shared.calibration_error_kernels import (
     Keyframes,
     Observers,
+    Surfaces,
     calibration_equations,
     calibration_moment,
     keyframes_at,
@@ -51,7 +52,8 @@ def with_calibration(pose: Pose, previous: Pose, problem: MapAlignment, flags: F
     T, camera = constant(pose.T_world_camera, np.float64), problem.camera
     points, lines, planes = problem.terms(pose.T_world_camera)
     samples = problem.map.planes.rows("samples_m", problem.matches.planes[:, 1])
-    surfaces = problem.surfaces_at(problem.keypoints.pixels[problem.matches.keypoints[:, 0]])
+    at_ends = problem.surfaces_at(lines.endpoints_px.reshape(-1, 2)).reshape(-1, 2, 4)
+    surfaces = Surfaces(problem.surfaces_at(problem.keypoints.pixels[problem.matches.keypoints[:, 0]]), at_ends)
     equations = calibration_equations(
         T, camera.intrinsics, camera.width, camera.height, calibration_scales(camera), pose.twist, points, lines, planes, flags, surfaces, samples,
         observed, keyframes,

@@ -59,11 +59,19 @@ class Observers(NamedTuple):
     planes: I32
 
 
+class Surfaces(NamedTuple):
+    """Planes in the camera's frame that points (n, 4) and the ends of lines (m, 2, 4) lie on, NaN for none: where the image errs, depth is read
+    elsewhere on them."""
+
+    points: F64
+    lines: F64
+
+
 class Equations(NamedTuple):
     """Normal equations by the pose, H (6, 6) and b (6,), and by the calibration, G (12, 12) and s (12,), with C (6, 12) between them.
 
-    The depth of lines adds `H_depth` and `C_depth`: it moves the pose, but tells nothing of the calibration, since the surfaces beside a line, and so
-    the effects of registration and delay on its depth, are not known."""
+    The depth of lines adds `H_depth` and `C_depth`: it moves the pose, but tells nothing of the calibration, since at an edge of two surfaces
+    it is not known which of them it was read on."""
 
     H: F64
     b: F64
@@ -252,13 +260,14 @@ def _add_points(
 
 @kernel(forceinline=True)
 def add_placed_error(
-    q: F64, p: F64, Q: F64, of_pose: F64, twist: F64, camera: F64, width: int, height: int, scales: F64, weight: float, E: F64, out: F64
-) -> None:
+    q: F64, surface: F64, p: F64, Q: F64, of_pose: F64, twist: F64, camera: F64, width: int, height: int, scales: F64, weight: float, E: F64,
+    out: F64,
+) -> None:  # fmt: skip
     """Add to `out` (3, 12), times a weight, the error in the camera's frame of a point that a keyframe placed by its pixel and its depth there.
 
-    The point is q (3,) in the keyframe's frame, which Q turns to the camera's, where it is p (3,); `of_pose` (6, 12) is the error of the keyframe's
-    pose. The slope of the surface is left out. E (3, 12) is overwritten."""
-    keypoint_errors(q, np.full(4, np.nan), twist, camera, width, height, E)
+    The point is q (3,) on a `surface` (4,) (NaN: not known; its slope is then left out) in the keyframe's frame, which Q turns to the camera's, where
+    it is p (3,); `of_pose` (6, 12) is the error of the keyframe's pose. E (3, 12) is overwritten."""
+    keypoint_errors(q, surface, twist, camera, width, height, E)
     z = q[2]
     for c in range(CALIBRATION):
         w = -z * E[2, c]
@@ -271,12 +280,13 @@ def add_placed_error(
 
 @kernel(forceinline=True)
 def _line_end_error(
-    R: F64, t: F64, world: F64, p: F64, observers: I32, keyframes: Keyframes, twist: F64, camera: F64, width: int, height: int, scales: F64,
-    E: F64, out: F64,
+    R: F64, t: F64, world: F64, p: F64, surface: F64, observers: I32, keyframes: Keyframes, twist: F64, camera: F64, width: int, height: int,
+    scales: F64, E: F64, out: F64,
 ) -> bool:  # fmt: skip
     """Fill `out` (3, 12): the mean error of the end of a line that its observers placed, weighted by the noise of their depth, less that of its
-    measurement; p (3,) is the end in the camera's frame. Returns False where the camera, or all observers, do not have it in their image."""
-    q, Q, weights = np.empty(3), np.empty((3, 3)), 0.0
+    measurement; p (3,) is the end in the camera's frame, on a `surface` (4,). Returns False where the camera, or all observers, do not have it in
+    their image."""
+    q, then, Q, weights = np.empty(3), np.empty(4), np.empty((3, 3)), 0.0
     out[:] = 0.0
     if not in_view(p, camera, width, height):
         return False
@@ -287,22 +297,24 @@ def _line_end_error(
         if not in_view(q, camera, width, height):
             continue
         rotation_between(R, keyframes.R[k], Q)
+        _plane_then(surface, Q, p, q, then)
         weight = 1.0 / sigma_z(q[2], keyframes.noise) ** 2
-        add_placed_error(q, p, Q, keyframes.errors[k], keyframes.twists[k], camera, width, height, scales, weight, E, out)
+        add_placed_error(q, then, p, Q, keyframes.errors[k], keyframes.twists[k], camera, width, height, scales, weight, E, out)
         weights += weight
     if weights == 0.0:
         return False
     out /= weights
-    add_placed_error(p, p, np.eye(3), np.zeros((6, CALIBRATION)), twist, camera, width, height, scales, -1.0, E, out)
+    add_placed_error(p, surface, p, np.eye(3), np.zeros((6, CALIBRATION)), twist, camera, width, height, scales, -1.0, E, out)
     return True
 
 
 @kernel
 def _add_lines(
-    R: F64, t: F64, camera: F64, width: int, height: int, scales: F64, twist: F64, lines: LineTerms, W: F64, V: F64, flags: U8, observers: I32,
-    keyframes: Keyframes, total: Equations,
+    R: F64, t: F64, camera: F64, width: int, height: int, scales: F64, twist: F64, lines: LineTerms, W: F64, V: F64, flags: U8, surfaces: F64,
+    observers: I32, keyframes: Keyframes, total: Equations,
 ) -> None:  # fmt: skip
-    """Add the inliers among the lines: the distances of their ends in the image, of information W (m, 2, 2), and those in depth, V (m, 2, 2)."""
+    """Add the inliers among the lines: the distances of their ends in the image, of information W (m, 2, 2), and those in depth, V (m, 2, 2).
+    `surfaces` (m, 2, 4) are the planes that their ends lie on, in the camera frame (NaN: none)."""
     p, D, m, E = np.empty((2, 3)), np.empty(3), np.empty(3), np.empty((3, CALIBRATION))
     error, J, K, r = np.empty((2, 3, CALIBRATION)), np.empty((2, 6)), np.empty((2, CALIBRATION)), np.empty(2)
     for i in range(len(flags)):
@@ -313,7 +325,7 @@ def _add_lines(
             world = lines.endpoints_m[i, end]
             to_camera(R, t, world, p[end])
             known = known and _line_end_error(
-                R, t, world, p[end], observers[i], keyframes, twist, camera, width, height, scales, E, error[end]
+                R, t, world, p[end], surfaces[i, end], observers[i], keyframes, twist, camera, width, height, scales, E, error[end]
             )  # fmt: skip
         if not known:
             continue
@@ -458,7 +470,7 @@ def _add_planes(
 @kernel
 def calibration_equations(
     T: F64, camera: F64, width: int, height: int, scales: F64, twist: F64, points: PointTerms, lines: LineTerms, planes: PlaneTerms, flags: Flags,
-    surfaces: F64, samples: F32, observers: Observers, keyframes: Keyframes,
+    surfaces: Surfaces, samples: F32, observers: Observers, keyframes: Keyframes,
 ) -> Equations:  # fmt: skip
     """Normal equations of the inliers among points, lines and identical planes at the pose T (4, 4), for parameters in units of `scales` (12,)."""
     R, t = split_pose(T)
@@ -469,8 +481,11 @@ def calibration_equations(
     n, m, p = len(points.positions_m), len(lines.endpoints_m), len(planes.kinds)
     weights = Weights(np.empty((n, 3, 3)), np.empty((m, 2, 2)), np.empty((m, 2, 2)), np.empty((p, 3, 3)))
     fill_weights(R, t, camera, points, lines, planes, weights)
-    _add_points(R, t, camera, width, height, scales, twist, points, weights.points, flags.points, surfaces, observers.points, keyframes, total)
-    _add_lines(R, t, camera, width, height, scales, twist, lines, weights.lines, weights.line_depths, flags.lines, observers.lines, keyframes, total)
+    _add_points(R, t, camera, width, height, scales, twist, points, weights.points, flags.points, surfaces.points, observers.points, keyframes, total)
+    _add_lines(
+        R, t, camera, width, height, scales, twist, lines, weights.lines, weights.line_depths, flags.lines, surfaces.lines, observers.lines,
+        keyframes, total,
+    )  # fmt: skip
     _add_planes(R, t, camera, width, height, scales, twist, planes, weights.planes, flags.planes, samples, observers.planes, keyframes, total)
     return total
 
