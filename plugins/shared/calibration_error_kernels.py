@@ -70,8 +70,8 @@ class Surfaces(NamedTuple):
 class Equations(NamedTuple):
     """Normal equations by the pose, H (6, 6) and b (6,), and by the calibration, G (12, 12) and s (12,), with C (6, 12) between them.
 
-    The depth of lines adds `H_depth` and `C_depth`: it moves the pose, but tells nothing of the calibration, since at an edge of two surfaces
-    it is not known which of them it was read on."""
+    The depth of lines adds `H_depth` and `C_depth`: it moves the pose, but is no evidence of the calibration, since at an edge of two surfaces it is
+    not known which of them it was read on."""
 
     H: F64
     b: F64
