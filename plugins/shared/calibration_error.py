@@ -22,6 +22,7 @@ from trihedron.pipeline.core.registry import register_covariance
 from trihedron.pipeline.core.types import F64, Camera, Pose
 from trihedron.plugins.shared.calibration_error_kernels import calibration_moment
 
+IMPRECISION = 0.2  # of sensitivities: of the motion by the calibration, what it is off by in any direction
 CALIBRATION_NAMES = (
     "the focal length fx", "the focal length fy", "the principal point in x", "the principal point in y", "the focal length of depth",
     "the registration of depth in x", "the registration of depth in y", "inverse depth", "depth in the corners", "the readout of colour",
@@ -42,9 +43,14 @@ def calibration_scales(camera: Camera) -> F64:
 
 @register_covariance("calibration")
 def calibration_covariance(pose: Pose) -> F64:
-    """Covariance (6, 6) of a pose's error by the calibration, part of its `map_covariance`."""
+    """Covariance (6, 6) of a pose's error by the calibration, part of its `map_covariance`.
+
+    `sensitivity` is known to a share, `IMPRECISION`, by which position and rotation err in any direction: along its own columns alone the error would
+    be taken to be exact in all others."""
     moment = calibration_moment(pose.calibration_information, pose.calibration_score)
     scaled = pose.depth_scale_sigma * matmul(pose.T_world_camera[:3, :3].T, pose.T_world_camera[:3, 3])
-    by_scale = np.zeros((6, 6))
-    by_scale[:3, :3] = np.outer(scaled, scaled)
-    return np.asarray(matmul(pose.sensitivity, moment, pose.sensitivity.T) + by_scale)
+    covariance = np.asarray(matmul(pose.sensitivity, moment, pose.sensitivity.T))
+    variance = covariance.diagonal().reshape(2, 3).mean(axis=1)  # of position and rotation, each about one axis
+    covariance = covariance + np.diag(np.repeat(IMPRECISION**2 * variance, 3))
+    covariance[:3, :3] += np.outer(scaled, scaled)
+    return covariance

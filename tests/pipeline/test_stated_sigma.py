@@ -11,6 +11,7 @@ from trihedron.pipeline.app.cli import main
 from trihedron.pipeline.core.registry import load_plugins
 from trihedron.pipeline.core.types import DEGRADED, LOST, OK, Pose
 from trihedron.pipeline.run.stated_sigma import CAUSES, calibration_variance_m2, dominant_cause, sigma_line, stated_sigma
+from trihedron.plugins.shared.calibration_error import IMPRECISION
 
 RUN = Path("runs/a")
 
@@ -45,7 +46,8 @@ def test_figures_and_line():
     found = sigma_of(poses)
     assert (found.poses, found.few_features) == (3, 0)
     assert [found.median_m, found.worst_m] == pytest.approx([3e-3, 7e-3]) and [found.median_deg, found.worst_deg] == pytest.approx([0.05, 0.2])
-    assert found.share == pytest.approx({"noise": 6 / 67, "drift": 44 / 67, "calibration": 17 / 67, "depth_scale": 0.0})
+    calibration = 17 * (1 + IMPRECISION**2)
+    assert found.share == pytest.approx({"noise": 6 / 67, "drift": (61 - calibration) / 67, "calibration": calibration / 67, "depth_scale": 0.0})
     line = "σ of ok poses: 3.0 mm, 0.05° (median), 7.0 mm, 0.20° (worst); mostly drift of the map"
     assert sigma_line(found.to_dict(), RUN) == line
 
