@@ -332,7 +332,8 @@ class Pose(Value):
     share of the points mapped before it that should have been matched since the camera was found again and were not, as a moving average over a
     thousand of them; `confirmations` the number of frames in a row since, at most three, that would be ok but for the loss, and with which planes
     agree. `turn_difference` is the rotation (rad, camera frame) by which planes turned more than the pose, as a moving average over ten frames, and
-    `usual_turn_difference` its usual size in one frame, 0.3° before the first. `plane_offsets` are how far half of the area of the matched planes
+    `usual_turn_difference` its usual size in one frame, 0.3° before the first; `turn_by_lag` what planes would turn by more if depth lagged colour by
+    the standard deviation of that time, as the same average. `plane_offsets` are how far half of the area of the matched planes
     lies at least from where the map has them, as a share of its distance, less where the calibration explains it, as moving averages over ten images
     full of matched planes and over a hundred, and how many such images there were, at most a hundred. `usual_accelerations` are the number of frames,
     at most ten, whose linear (m/s²) and angular (rad/s²) acceleration is known, and the largest of these, less 1 % for each frame since.
@@ -382,6 +383,7 @@ class Pose(Value):
     depth_disagreement: Annotated[float, Within(0.0, 1.0)] = 0.0
     usual_depth_disagreement: Annotated[float, Within(0.0, 1.0)] = 0.0
     relative_sensitivity: Annotated[F64, Shape(6, CALIBRATION), Finite()] = field(default_factory=lambda: np.zeros((6, CALIBRATION)))
+    turn_by_lag: Annotated[F64, Shape(3), Finite()] = field(default_factory=lambda: np.zeros(3))
 
     @property
     def local_covariance(self) -> F64:

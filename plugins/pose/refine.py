@@ -125,7 +125,7 @@ class Refine(JudgementOptions):
             reason = f"the camera jumped, and the map does not determine the pose by itself: only {inliers.total} of {inliers.matches} matches agree"
             return self._lost(start, reason, rotation, previous, map, submap)
         pose = in_world(pose, previous, solution, problem)
-        pose = with_disagreement(with_turn_difference(pose, previous, tracks, planes), previous, inliers, static)
+        pose = with_disagreement(with_turn_difference(pose, previous, tracks, planes, camera), previous, inliers, static)
         points_known, _, planes_known = problem.terms(T)
         pose = with_scale_difference(pose, previous, points_known.positions_m, keypoints.points_m[matches.keypoints[:, 0]])
         pose = with_depth_disagreement(pose, previous, camera, points_known, solution.points)

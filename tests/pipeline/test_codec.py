@@ -358,7 +358,7 @@ def test_a_value_of_an_older_version_names_the_version_and_the_fields():
         "twist",
     }
     later |= {"reference_twist", "keyframe_covariance", "lost_from", "missing", "depth_scale_sigma", "turn_difference", "usual_turn_difference"}
-    later |= {"plane_offsets"}
+    later |= {"plane_offsets", "turn_by_lag"}
     kept = [array for array in message.arrays if array.name not in later]
     del message.arrays[:]
     message.arrays.extend([*kept, type(kept[0])(name="quality", dtype="float", encoding="raw", data=bytes(8))])
@@ -367,7 +367,7 @@ def test_a_value_of_an_older_version_names_the_version_and_the_fields():
         "'calibration_score', 'confirmations', 'depth_disagreement', 'depth_scale_sigma', 'disagreement', 'jumps', 'keyframe_covariance', "
         "'lost_from', 'map_covariance', 'missing', "
         "'noise_scale', 'plane_offsets', 'reference_twist', "
-        "'relative_sensitivity', 'repeats', 'scale_difference', 'sensitivity', 'submap', 'turn_difference', 'twist', 'unrecognised', "
+        "'relative_sensitivity', 'repeats', 'scale_difference', 'sensitivity', 'submap', 'turn_by_lag', 'turn_difference', 'twist', 'unrecognised', "
         "'usual_accelerations', 'usual_depth_disagreement', 'usual_turn_difference' "
         "that it lacks, "
         "without its field 'quality'; upgrade what can be read of it with: trihedron convert SRC DST.mcap"
