@@ -21,11 +21,13 @@ from trihedron.plugins.pose.calibration_uncertainty import carried_calibration, 
 from trihedron.plugins.pose.map_alignment import MapAlignment
 from trihedron.plugins.pose.world_uncertainty_kernels import scatter_and_drift
 from trihedron.plugins.shared.calibration_error import calibration_covariance
+from trihedron.plugins.shared.calibration_error_kernels import Observers
 from trihedron.plugins.shared.pose_optimizer import LANDMARK_SCORE, PoseSolution
-from trihedron.plugins.shared.pose_optimizer_kernels import Flags
+from trihedron.plugins.shared.pose_optimizer_kernels import OUTLIER, Flags
 
 SCALE_FRAMES = 10  # over which the scale of the residuals is averaged
 SCALE_OUTLIER = 4.0  # times the average that a frame's scale counts at most
+LATE_KEYFRAMES = 10  # before the reference keyframe, of late: what none of them observed has long been out of view
 UNSEEN_SPEED = 0.2  # m/s and rad/s of a hand-held camera, root mean square: 0.17 to 0.20 and 0.12 to 0.20 (three sequences)
 
 
@@ -85,6 +87,7 @@ def in_world(pose: Pose, previous: Pose, solution: PoseSolution, problem: MapAli
     rows, created, observed = problem.keyframes
     poses, covariances = problem.map.keyframes.columns_at(rows, "T_world_camera", "world_covariance")
     T, flags = pose.T_world_camera, Flags(solution.points, solution.lines, solution.planes)
+    flags = without_chance_agreement(flags, observed, rows, pose.reference)
     scale, by_drift, supported = scatter_and_drift(
         constant(T, np.float64), problem.camera.intrinsics, *problem.terms(T), flags, created, poses, covariances
     )
@@ -100,6 +103,28 @@ def in_world(pose: Pose, previous: Pose, solution: PoseSolution, problem: MapAli
         moving = with_calibration(moving, previous, problem, flags, keyframes_seen(moving, problem.map, problem.camera, rows, poses), observed)
     in_world = _with_world_covariance(with_relative_sensitivity(moving, problem.map), by_drift)
     return _with_unseen_motion(in_world, previous) if pose.repeats else in_world
+
+
+def without_chance_agreement(flags: Flags, observed: Observers, rows: I32, reference: int) -> Flags:
+    """Return the flags of the matches that show where the camera is in the world: without inliers among landmarks that no keyframe has observed of
+    late, if most matches with such landmarks are outliers.
+
+    Args:
+        flags: those of points, lines and planes, of which the identical ones are first.
+        observed: numbers of the keyframes that observed them.
+        rows: (k,) rows of these keyframes in the map, increasing.
+        reference: row of the reference keyframe.
+
+    Where a camera that has drifted comes back, it matches edges with others that look the same, and a few agree by chance. Each would count as if the
+    camera erred as it did when that place was mapped, although the pose, which hundreds of new landmarks determine, does not return by it."""
+    earlier = [rows[seen.max(axis=1)] < reference - LATE_KEYFRAMES for seen in observed]
+    of_earlier = [kind[: len(seen)][seen] for kind, seen in zip(flags, earlier)]
+    if 2 * sum(np.count_nonzero(agree) for agree in of_earlier) >= sum(map(len, of_earlier)):
+        return flags
+    kept = Flags(*(kind.copy() for kind in flags))
+    for kind, seen in zip(kept, earlier):
+        kind[: len(seen)][seen] = OUTLIER
+    return kept
 
 
 def _with_unseen_motion(pose: Pose, previous: Pose) -> Pose:

@@ -12,10 +12,11 @@ from trihedron.plugins.pose.world_uncertainty import (
     keyframe_covariance,
     keyframe_uncertainty,
     propagate_world_covariance,
+    without_chance_agreement,
 )
 from trihedron.plugins.pose.world_uncertainty_kernels import covariance_of_keyframes, residual_scale
 from trihedron.plugins.shared.calibration_error_kernels import Observers
-from trihedron.plugins.shared.pose_optimizer_kernels import Groups
+from trihedron.plugins.shared.pose_optimizer_kernels import Flags, Groups
 
 
 def equations(rng, groups, common):
@@ -45,6 +46,22 @@ def test_keyframes_of_landmarks_are_numbered_in_the_order_of_time():
     observed = Observers(np.array([[7, -1], [2, 9], [7, -1]], np.int32), np.array([[3, 7]], np.int32), np.array([[5, -1]], np.int32))
     assert number_keyframes(12, created, observed).tolist() == [2, 3, 5, 7, 9]
     assert [part.tolist() for part in (*created, *observed)] == [[3, 0, 3], [], [2], [[3, -1], [0, 4], [3, -1]], [[1, 3]], [[2, -1]]]
+
+
+@pytest.mark.parametrize("agree, kept", [(2, False), (3, True), (0, True)])
+def test_a_few_old_landmarks_agree_by_chance(agree, kept):
+    """Of six matches with landmarks that keyframe 30 was the last to observe, of points, a line and a wall, so many are inliers, beside those of
+    keyframe 45; the reference keyframe is the 50th. A relation of planes is none of them."""
+    rows = np.array([3, 30, 45, 50], np.int32)
+    observed = Observers(
+        np.array([[1, 0]] * 4 + [[2, 0]] * 5, np.int32), np.array([[-1, 1], [2, -1]], np.int32), np.array([[1, -1], [3, 2]], np.int32)
+    )
+    old = np.arange(6) < agree
+    flags = Flags(*(np.array(kind, np.uint8) for kind in ([*old[:4], 1, 1, 1, 1, 0], [old[4], 1], [old[5], 1, 1])))
+    found = without_chance_agreement(flags, observed, rows, 50)
+    wanted = flags if kept else Flags(*(np.array(kind, np.uint8) for kind in ([0] * 4 + [1, 1, 1, 1, 0], [0, 1], [0, 1, 1])))
+    assert all(np.array_equal(*kinds) for kinds in zip(found, wanted))
+    assert [kind.sum() for kind in flags] == [4 + old[:4].sum(), 1 + old[4], 2 + old[5]]  # the given ones stay
 
 
 def test_average_of_a_random_walk():
