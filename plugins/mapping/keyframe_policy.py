@@ -14,12 +14,13 @@ from trihedron.pipeline.core.types import F64, Frame, Map, Matches, Planes, Pose
 from trihedron.plugins.mapping.covisibility_graph import WEIGHTS, newest_keyframes
 from trihedron.plugins.shared.contradiction import contradicting_depth
 
+RATE = 30.0  # images a second of the camera whose frames the options count; that of others is counted as time
 UNCHANGED = 0.25  # of the view change of a keyframe, that suffices after max_frames: a camera at rest adds none
 
 
 @dataclass(frozen=True)
 class KeyframeOptions:
-    """Options of the keyframe policy."""
+    """Options of the keyframe policy. Frames are thirtieths of a second, whatever the rate of the camera."""
 
     min_frames: PositiveInt = 3  # between keyframes, unless landmarks run out
     max_frames: PositiveInt = 30  # after which a quarter of the view change below is enough
@@ -46,7 +47,7 @@ def needs_keyframe(options: KeyframeOptions, frame: Frame, pose: Pose, planes: P
         return True
     if pose.repeats or contradicting_depth(pose):
         return False
-    frames = frame.index - int(keyframes.row("index", newest[0]))
+    frames = round(1e-9 * RATE * (frame.stamp_ns - int(keyframes.row("stamp_ns", newest[0]))))
     spans = [keyframes.row(kind.span_column, newest[0]).tolist() for kind in WEIGHTS]
     tracked_share = _weighted_total(pose.inliers.tolist()) / max(_weighted_total([end - begin for begin, end in spans]), 1)
     urgent = tracked_share < options.urgent_share

@@ -73,6 +73,16 @@ def test_a_keyframe_is_made_at_once_where_landmarks_run_out(inliers, sigma_m):
     assert after is not None and len(after.keyframes) == 2
 
 
+@pytest.mark.parametrize("index, hz, made", [(1, 30.0, False), (2, 30.0, False), (3, 30.0, True), (1, 10.0, True), (5, 60.0, False), (6, 60.0, True)])
+def test_the_time_since_the_last_keyframe_counts_whatever_the_rate(index, hz, made):
+    """A tenth of a second: three frames at 30 images a second, one at 10."""
+    world = World()
+    map = step(Covisibility(), world, None, 0)
+    frame = dataclasses.replace(world.frame(index), stamp_ns=round(1e9 * index / hz))
+    after = step(Covisibility(), world, map, index, at=20, frame=frame, inliers=(60, 10, 3))
+    assert (after is not None) is made
+
+
 def test_a_wall_that_is_new_makes_a_keyframe():
     world = World()
     keypoints, segments, planes = world.features(np.eye(4), 0)
