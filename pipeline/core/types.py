@@ -624,7 +624,8 @@ class Map(Value):
     `revision` counts versions, `loop_closed` is that of the last one with a correction by `loop` or a merged sub-map; a row of `point_observations`
     and its siblings is a keyframe (row), a landmark, and its measurement. A row of `proposals` is a frame of one sub-map that was recognised in an
     older one: its pose relative to a keyframe of each, and the sum of both covariances (camera frame). Several that agree merge the two.
-    `calibration_information` and `calibration_score` are those of the newest keyframe's pose."""
+    `calibration_information` and `calibration_score` are those of the newest keyframe's pose, `calibration_errors` the errors of the calibration that
+    the last alignment with the Manhattan frame has undone."""
 
     version: ClassVar[int] = 9
     revision: int
@@ -641,6 +642,7 @@ class Map(Value):
         default_factory=lambda: np.zeros((CALIBRATION, CALIBRATION))
     )
     calibration_score: Annotated[F64, Shape(CALIBRATION), Finite()] = field(default_factory=lambda: np.zeros(CALIBRATION))
+    calibration_errors: Annotated[F64, Shape(CALIBRATION), Finite()] = field(default_factory=lambda: np.zeros(CALIBRATION))
 
     @cached_property
     def memo(self) -> dict[Hashable, Any]:
@@ -674,7 +676,7 @@ class Correction(Value):
     """New poses of keyframes and positions of landmarks, by id, from bundle adjustment or loop closing of revision `based_on`. `*_information`
     (world, 1/m²; of each end of a line) and `plane_covariance`, of (a, b, d), replace those of the map: no measurement is counted twice.
     `sensitivity`, `aligned`, `undone` and `undone_sensitivity` replace these columns of the corrected keyframes (`mapping.landmarks`); they are
-    of no keyframe where these stay as they are."""
+    of no keyframe where these stay as they are. `calibration_errors` replace those of the map where `undone` is of keyframes."""
 
     version: ClassVar[int] = 3
 
@@ -696,6 +698,7 @@ class Correction(Value):
     undone_sensitivity: Annotated[F64, Shape("u", 6, CALIBRATION), Finite()] = field(
         default_factory=lambda: np.zeros((0, 6, CALIBRATION)), kw_only=True
     )
+    calibration_errors: Annotated[F64, Shape(CALIBRATION), Finite()] = field(default_factory=lambda: np.zeros(CALIBRATION), kw_only=True)
 
 
 PLACES = Columns({"keyframe": ("i4", (), IndexInto("map.keyframes")), "descriptor": ("f4", (None,), Finite())})

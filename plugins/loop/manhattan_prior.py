@@ -82,14 +82,15 @@ def estimate_manhattan_prior(map: Map, camera: Camera) -> ManhattanPrior | None:
     planes, at_plane = _middle_observers(map.planes, rows)
     lines, at_line = _middle_observers(map.lines, rows)
     coefficients, covariance = map.planes.rows("coefficients", planes), map.planes.rows("covariance", planes)
-    R = estimate_axes(coefficients, covariance, map.planes.rows("found", planes))
+    poses, twists, sensitivity = map.keyframes.columns_at(rows, "T_world_camera", "twist", "sensitivity")
+    expected = _expected(map, rows)
+    R = estimate_axes(_moved_with(coefficients, matmul(expected, invert(poses))[at_plane]), covariance, map.planes.rows("found", planes))
     if R is None:
         return None
     ends, end_covariance = map.lines.rows("endpoints_m", lines), inv_symmetric(map.lines.rows("information", lines))
     vectors, information = measured_directions(
         coefficients, covariance, WALL_SIGMA, ends.astype(np.float32), end_covariance.astype(np.float32), EDGE_SIGMA, NO_MEANS, NO_MEANS[:, 0]
     )
-    poses, twists, sensitivity = map.keyframes.columns_at(rows, "T_world_camera", "twist", "sensitivity")
     samples, seen_by = map.planes.columns_at(planes, "samples_m", "observers")
     views = Views(
         poses, twists, sensitivity, camera.intrinsics, camera.width, camera.height, calibration_scales(camera), camera.depth_noise.coefficients
@@ -97,7 +98,28 @@ def estimate_manhattan_prior(map: Map, camera: Camera) -> ManhattanPrior | None:
     of_planes = plane_turns(coefficients, samples, index_of(seen_by, rows), at_plane, views)
     of_lines = line_turns(ends, index_of(map.lines.rows("observers", lines), rows), at_line, views)
     turns, observers = np.concatenate([of_planes, of_lines]), np.concatenate([at_plane, at_line])
-    return _prior_near(Directions(R, rows, poses, vectors, information, turns, observers), poses)
+    return _prior_near(Directions(R, rows, poses, vectors, information, turns, observers), expected)
+
+
+def _expected(map: Map, rows: I32) -> F64:
+    """The poses (k, 4, 4) of keyframes once the errors of the calibration that the last alignment found are undone in those that were added since."""
+    before, sensitivity, _, undone, taken = map.keyframes.columns_at(rows, "T_world_camera", "sensitivity", *ALIGNMENT)
+    if not map.calibration_errors.any():
+        return np.asarray(before)
+    total = sensitivity + taken
+    xi = matmul(total - _with_the_first(before, total), map.calibration_errors) - undone
+    return np.asarray(matmul(before, np.array([exp_se3(x) for x in xi])))
+
+
+def _with_the_first(poses: F64, sensitivities: F64) -> F64:
+    """The part (k, 6, 12) of the sensitivities of keyframes at poses (k, 4, 4) that moves them with the first, which is not corrected."""
+    return np.asarray(matmul(adjoint_between(poses, poses[:1]), sensitivities[0]))
+
+
+def _moved_with(planes: F64, motions: F64) -> F64:
+    """Planes (n, 4) that are moved each by a motion (n, 4, 4) of the world."""
+    normals = matmul(motions[:, :3, :3], planes[:, :3, None])[..., 0]
+    return np.column_stack([normals, planes[:, 3] - np.einsum("ni,ni->n", normals, motions[:, :3, 3])])
 
 
 def _prior_near(directions: Directions, expected: F64) -> ManhattanPrior:
@@ -176,6 +198,7 @@ def correct_loop(options: CorrectionOptions, map: Map, keyframe: int, found: Pos
         aligned=moved + _motions(looped.poses, solved.poses),
         undone=undone,
         undone_sensitivity=errors - solved.sensitivity,
+        calibration_errors=map.calibration_errors,
     )
 
 
@@ -207,6 +230,7 @@ def align_with_manhattan(options: StraighteningOptions, map: Map, camera: Camera
         aligned=_motions(unaligned.poses, solved.poses),
         undone=matmul(unaligned.errors, aligned.calibration.parameters),
         undone_sensitivity=unaligned.common + unaligned.errors - sensitivity,
+        calibration_errors=aligned.calibration.parameters,
     )
 
 
@@ -232,7 +256,7 @@ def _unaligned(options: StraighteningOptions, map: Map, keyframes: I32, pairs: I
     """Return keyframes, of which `pairs` (e, 2) are connected, as they would be without any alignment. Pairs of different visits are left out: it was
     in their corrected poses that they agreed."""
     before, sensitivity, moved, _, taken = map.keyframes.columns_at(keyframes, "T_world_camera", "sensitivity", *ALIGNMENT)
-    common = np.asarray(matmul(adjoint_between(before, before[:1]), sensitivity[0] + taken[0]))
+    common = _with_the_first(before, sensitivity + taken)
     poses = matmul(before, np.array([exp_se3(-xi) for xi in moved]))
     chain = present_edges(options, _moved(map, keyframes, poses), keyframes, pairs[pairs[:, 1] - pairs[:, 0] <= LINKS])
     return Unaligned(poses, sensitivity + taken - common, common, chain)

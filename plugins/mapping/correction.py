@@ -52,6 +52,8 @@ def _correct_errors(map: Map, correction: Correction, ids: I32, last: int, later
             continue
         new, own, old = given[known], map.keyframes.rows(name, later), map.keyframes.row(name, int(ids[last]))
         changed[name] = np.concatenate([new, own + matmul(to_later, new[last] - old)])
+    if len(correction.undone):
+        map = replace(map, calibration_errors=correction.calibration_errors)
     return replace(map, keyframes=map.keyframes.updated(rows, **changed)) if changed else map
 
 

@@ -216,14 +216,14 @@ OLDER = [  # format, commit, what differs
     (
         1,
         "ad955b7",
-        "topic /map holds Map version 1, this program reads version 9, with the field 'calibration_information', 'calibration_score', 'loop_closed', "
-        "'proposals' that it lacks, and 1 more",
+        "topic /map holds Map version 1, this program reads version 9, with the field 'calibration_errors', 'calibration_information', "
+        "'calibration_score', 'loop_closed', 'proposals' that it lacks, and 1 more",
     ),
     (
         2,
         "509b7cf",
-        "topic /map holds Map version 3, this program reads version 9, with the field 'calibration_information', 'calibration_score', 'loop_closed', "
-        "'proposals' that it lacks, and 2 more",
+        "topic /map holds Map version 3, this program reads version 9, with the field 'calibration_errors', 'calibration_information', "
+        "'calibration_score', 'loop_closed', 'proposals' that it lacks, and 2 more",
     ),
 ]
 

@@ -97,6 +97,8 @@ def test_errors_by_the_calibration_are_corrected_with_the_keyframes():
     for name, value in before.items():
         assert after.column(name)[:3] == pytest.approx(0.5 * value[:3])
         assert after.column(name)[3] == pytest.approx(value[3] - 0.5 * to_last @ value[2])
+    known = dataclasses.replace(half, calibration_errors=np.ones(CALIBRATION))
+    assert np.array_equal(apply_correction(map, known).calibration_errors, np.ones(CALIBRATION)) and not map.calibration_errors.any()
     stranger = dataclasses.replace(moved, sensitivity=before["sensitivity"])  # of four keyframes, for three
     for unchanged in (moved, stranger):
         assert all(np.array_equal(apply_correction(map, unchanged).keyframes.column(name), value) for name, value in before.items())

@@ -182,6 +182,19 @@ def test_what_was_undone_before_counts_and_is_not_undone_again():
     assert PlanesLoop()(apply_correction(moved, aligned), frame()) is None  # nothing is left to be undone
 
 
+def test_walls_are_looked_for_where_the_known_calibration_has_moved_them():
+    """The map turns by 20° on its way, too far for two axes to have walls, as a calibration would turn it that an alignment before has found."""
+    map, truth = corridor(np.radians([0.0, 20.0, 0.0]), axes=(0, 2, 0))
+    turns = np.array([log_so3(R.T @ truth) / 1.5 for R in map.keyframes.column("T_world_camera")[:, :3, :3]])
+    map = with_sensitivity(map, turns)
+    assert PlanesLoop()(map, frame()) is None
+    known = dataclasses.replace(map, calibration_errors=1.4 * np.eye(CALIBRATION)[0])
+    aligned = PlanesLoop()(known, frame())
+    assert errors_deg(aligned.T_world_keyframe[:, :3, :3], truth).max() < 0.5
+    assert aligned.calibration_errors == pytest.approx(1.5 * np.eye(CALIBRATION)[0], abs=0.05)
+    assert np.array_equal(apply_correction(known, aligned).calibration_errors, aligned.calibration_errors)
+
+
 def test_keyframes_that_drifted_beyond_the_reach_of_an_axis_are_aligned_with_those_before():
     """The map turns by 8° on its way, so that walls at its ends are off all axes by more than 2°, and a calibration would have turned it alike."""
     map, truth = corridor(np.radians([0.0, 8.0, 0.0]))
