@@ -18,12 +18,13 @@ from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat, Posit
 from trihedron.pipeline.core.types import F64, I32, Correction, Frame, Map, Matches
 from trihedron.plugins.loop.initial_alignment import initial_pose
 from trihedron.plugins.loop.manhattan_prior import align_with_manhattan, correct_loop, estimate_manhattan_prior
+from trihedron.plugins.loop.registration_error import registration_error
 from trihedron.plugins.loop.storeys import on_storey_of_last
 from trihedron.plugins.mapping.covisibility_graph import LocalWindow, current_submap, keyframes_of, observed_by
 from trihedron.plugins.mapping.data_association import PredictedPose, SearchOptions, search_map
 from trihedron.plugins.mapping.keyframe_features import features_of
 from trihedron.plugins.mapping.landmark_kinds import KINDS, LINE, PLANE, POINT
-from trihedron.plugins.places.verification import free_space_violation, solve_pose_in_map
+from trihedron.plugins.places.verification import free_space_violation, solve_pose_in_map, terms_in_map
 from trihedron.plugins.shared.pose_optimizer import LANDMARK_SCORE, PoseSolution
 
 CHI2_6 = 22.46  # 99.9 % of six degrees of freedom
@@ -85,12 +86,12 @@ def _first_verified(options: LoopOptions, map: Map, frame: Frame, candidates: Ca
         found = _verify(options, map, frame, place) if place.found < options.shared else None
         if found is not None:
             prior = estimate_manhattan_prior(map, frame.camera) if options.straighten else None
-            return correct_loop(options, map, keyframe, found, prior)
+            return correct_loop(options, map, keyframe, *found, prior)
     return None
 
 
-def _verify(options: LoopOptions, map: Map, frame: Frame, place: Place) -> PoseSolution | None:
-    """Pose of the newest keyframe by the landmarks of a place, or None when the loop is not accepted."""
+def _verify(options: LoopOptions, map: Map, frame: Frame, place: Place) -> tuple[PoseSolution, F64] | None:
+    """Pose of the newest keyframe by the landmarks of a place, and its error (6, 12) by the calibration; None when the loop is not accepted."""
     newest = len(map.keyframes) - 1
     T = T_before = map.keyframes.row("T_world_camera", newest)
     sigma_m, sigma_rad = drift_sigma_m(options, place.path_m), 2.0 * np.radians(options.rotation_sigma_deg)
@@ -105,7 +106,8 @@ def _verify(options: LoopOptions, map: Map, frame: Frame, place: Place) -> PoseS
         T = found.T_world_camera
     if not accept_loop(options, found, matches, expected, T_before) or free_space_violation(T, frame, map, place.window) > options.max_through:
         return None
-    return found
+    terms = terms_in_map(T, map, matches, frame.camera, *features)
+    return found, registration_error(map, frame.camera, matches, terms, found, information)
 
 
 def accept_loop(options: LoopOptions, found: PoseSolution, matches: Matches, expected: F64, T_before: F64) -> bool:

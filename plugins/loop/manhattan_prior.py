@@ -20,7 +20,7 @@ from trihedron.plugins.loop.keyframe_correction import correct_keyframes
 from trihedron.plugins.loop.manhattan_prior_kernels import Views, keyframe_rotations, line_turns, plane_turns
 from trihedron.plugins.mapping.covisibility_graph import DriftOptions, current_submap, keyframes_of, odometry, revisits
 from trihedron.plugins.mapping.landmarks import ALIGNMENT, index_of
-from trihedron.plugins.shared.calibration_error import calibration_scales
+from trihedron.plugins.shared.calibration_error import calibration_scales, sensitivity_covariance
 from trihedron.plugins.shared.lie_kernels import log_so3_each
 from trihedron.plugins.shared.manhattan_frames_kernels import (
     Walls,
@@ -44,7 +44,6 @@ PASSES = 3  # of aligning: a direction that one brings within REACH of an axis c
 GATE = 2.0  # σ at which a robust weight is one half
 EXPLAINED = 0.5  # share of the walls (by views) that must stand on the axes
 NO_MEANS = np.zeros((0, 3))
-NO_EDGES = Edges(np.zeros((0, 2), np.int32), np.zeros((0, 4, 4)), np.zeros((0, 6, 6)))
 
 
 @dataclass(frozen=True)
@@ -178,19 +177,27 @@ class StraighteningOptions(CorrectionOptions, Protocol):
         """Least rotation of the newest keyframe for which the map is corrected."""
 
 
-def correct_loop(options: CorrectionOptions, map: Map, keyframe: int, found: PoseSolution, prior: ManhattanPrior | None) -> Correction:
-    """Correct the tracked sub-map by a verified loop: the newest keyframe's pose, with its covariance, relative to `keyframe`. The sensitivities
-    become those of the corrected poses; their covariance stays, although most drift is undone. Keyframes as they would be without any alignment are
-    corrected by the loop alone."""
+def correct_loop(
+    options: CorrectionOptions, map: Map, keyframe: int, found: PoseSolution, found_error: F64, prior: ManhattanPrior | None
+) -> Correction:
+    """Correct the tracked sub-map by a verified loop: the newest keyframe's pose, with its covariance and its error by the calibration (6, 12),
+    relative to `keyframe`.
+
+    The loop errs by what is not known of the calibration; what the last alignment found of it is undone. The sensitivities become those of the
+    corrected poses; their covariance stays, although most drift is undone. Keyframes as they would be without any alignment are corrected by the loop
+    alone, as it was measured."""
     rows = keyframes_of(map, current_submap(map))
     before, sensitivity, moved, undone, taken = map.keyframes.columns_at(rows, "T_world_camera", "sensitivity", *ALIGNMENT)
     place, newest = np.searchsorted(rows, [keyframe, len(map.keyframes) - 1])
-    information = np.asarray(inv(found.covariance), np.float64)[None]
-    closing = Edges(np.array([[place, newest]], np.int32), matmul(invert(before[place]), found.T_world_camera)[None], information)
+    covariance = found.covariance + sensitivity_covariance(found_error, map.calibration_information, map.calibration_score)
+    measured, undo = matmul(invert(before[place]), found.T_world_camera), matmul(found_error, map.calibration_errors)
+    pair, information = np.array([[place, newest]], np.int32), np.asarray(inv(covariance), np.float64)[None]
     present = present_edges(options, map, rows, connected_keyframes(options, map, rows))
-    solved = _solve_with_prior(before, sensitivity, present, closing, prior)
+    corrected = Loop(Edges(pair, matmul(measured, exp_se3(undo))[None], information), found_error[None])
+    solved = _solve_with_prior(before, sensitivity, present, corrected, prior)
     unaligned = np.concatenate([sensitivity + taken, moved[..., None], undone[..., None]], axis=2)
-    looped = _solve_with_prior(before, unaligned, present, closing, None)
+    as_measured = Loop(Edges(pair, measured[None], information), np.column_stack([found_error, np.zeros(6), undo])[None])
+    looped = _solve_with_prior(before, unaligned, present, as_measured, None)
     errors, moved, undone = looped.sensitivity[..., :CALIBRATION], looped.sensitivity[..., CALIBRATION], looped.sensitivity[..., -1]
     return replace(
         correct_keyframes(map, rows, before, solved.poses),
@@ -232,6 +239,14 @@ def align_with_manhattan(options: StraighteningOptions, map: Map, camera: Camera
         undone_sensitivity=unaligned.common + unaligned.errors - sensitivity,
         calibration_errors=aligned.calibration.parameters,
     )
+
+
+@dataclass(frozen=True)
+class Loop:
+    """Edges that close loops, and the errors (e, 6, m) of what they measure by m parameters."""
+
+    edges: Edges
+    errors: F64
 
 
 @dataclass(frozen=True)
@@ -285,7 +300,7 @@ def _align(options: StraighteningOptions, map: Map, prior: ManhattanPrior, pairs
     rotations = prior.rotations + undone[:, 3:] - matmul(directions, calibration.parameters)
     rest = replace(prior, rotations=rotations, sensitivity=directions)
     present = present_edges(options, _moved(map, keyframes, corrected), keyframes, pairs)
-    return Aligned(calibration, Solved(corrected, errors), _solve_with_prior(corrected, errors, present, NO_EDGES, rest))
+    return Aligned(calibration, Solved(corrected, errors), _solve_with_prior(corrected, errors, present, None, rest))
 
 
 def _estimate_calibration(map: Map, prior: ManhattanPrior, unaligned: Unaligned, directions: F64) -> CalibrationEstimate:
@@ -321,12 +336,14 @@ def _angles(before: F64, after: F64) -> F64:
     return np.asarray(np.arccos(np.clip(cosine, -1.0, 1.0)))
 
 
-def _solve_with_prior(before: F64, sensitivity: F64, present: Edges, closing: Edges, prior: ManhattanPrior | None) -> Solved:
+def _solve_with_prior(before: F64, sensitivity: F64, present: Edges, closing: Loop | None, prior: ManhattanPrior | None) -> Solved:
     """Solve for the poses of keyframes by a pose graph, in which the Manhattan frame is one more node, whose direction every keyframe measures.
-    Edges of the `present` poses `before` err by the calibration as these do, by their `sensitivity`; a closing loop does not, and directions by that
-    of the prior."""
-    count, edges = len(before), concatenate_edges(present, closing)
-    differences = np.concatenate([np.zeros((len(present.pairs), *sensitivity.shape[1:])), edge_errors(before, closing, sensitivity)])
+    Edges of the `present` poses `before` err by the calibration as these do, by their `sensitivity`; a `closing` loop as it states, and directions by
+    that of the prior."""
+    count, edges, differences = len(before), present, np.zeros((len(present.pairs), *sensitivity.shape[1:]))
+    if closing is not None:
+        edges = concatenate_edges(present, closing.edges)
+        differences = np.concatenate([differences, edge_errors(before, closing.edges, sensitivity) - closing.errors])
     if prior is not None:
         axes = pose_matrix(prior.directions.R_world_manhattan, np.zeros(3))
         before, sensitivity = np.concatenate([before, axes[None]]), np.concatenate([sensitivity, np.zeros_like(sensitivity[:1])])

@@ -16,7 +16,7 @@ from trihedron.plugins.mapping.covisibility_graph import VICINITY_DEG, VICINITY_
 from trihedron.plugins.mapping.data_association import PredictedPose, SearchOptions, search_map
 from trihedron.plugins.mapping.landmark_kernels import MIN_DEPTH_M
 from trihedron.plugins.mapping.projection import in_image, line_terms, plane_terms, point_terms
-from trihedron.plugins.shared.pose_optimizer import LANDMARK_SCORE, PoseSolution, solve_pose
+from trihedron.plugins.shared.pose_optimizer import LANDMARK_SCORE, PoseSolution, Terms, solve_pose
 
 TOLERANCE_M, TOLERANCE_SIGMAS = 0.1, 5.0  # of depth, before a surface is violated
 DETAILED = np.array([100, 30])  # points and lines expected in view, from which on a place is recognised by these
@@ -118,6 +118,11 @@ def solve_pose_in_map(
     T: F64, T_prior: F64, information: F64, map: Map, matches: Matches, camera: Camera, keypoints: Keypoints, segments: Segments, planes: Planes
 ) -> PoseSolution:
     """Estimate the pose by matches with the map, without relations of planes, from T; `information` (6, 6) is that of the prior T_prior."""
-    points, none = point_terms(map, keypoints, matches.keypoints), matches.parallel[:0]
-    lines, walls = line_terms(map, segments, matches.segments, T, camera, LINE_PX), plane_terms(map, planes, matches.planes, none, none, 1.0)
-    return solve_pose(T, camera, T_prior, information, points, lines, walls)
+    return solve_pose(T, camera, T_prior, information, *terms_in_map(T, map, matches, camera, keypoints, segments, planes))
+
+
+def terms_in_map(T: F64, map: Map, matches: Matches, camera: Camera, keypoints: Keypoints, segments: Segments, planes: Planes) -> Terms:
+    """Return the terms of matches with the map, without relations of planes; the extent of lines is that seen from T."""
+    none = matches.parallel[:0]
+    points, lines = point_terms(map, keypoints, matches.keypoints), line_terms(map, segments, matches.segments, T, camera, LINE_PX)
+    return points, lines, plane_terms(map, planes, matches.planes, none, none, 1.0)

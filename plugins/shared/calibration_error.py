@@ -43,14 +43,19 @@ def calibration_scales(camera: Camera) -> F64:
 
 @register_covariance("calibration")
 def calibration_covariance(pose: Pose) -> F64:
-    """Covariance (6, 6) of a pose's error by the calibration, part of its `map_covariance`.
-
-    `sensitivity` is known to a share, `IMPRECISION`, by which position and rotation err in any direction: along its own columns alone the error would
-    be taken to be exact in all others."""
-    moment = calibration_moment(pose.calibration_information, pose.calibration_score)
+    """Covariance (6, 6) of a pose's error by the calibration, part of its `map_covariance`."""
+    covariance = sensitivity_covariance(pose.sensitivity, pose.calibration_information, pose.calibration_score)
     scaled = pose.depth_scale_sigma * matmul(pose.T_world_camera[:3, :3].T, pose.T_world_camera[:3, 3])
-    covariance = np.asarray(matmul(pose.sensitivity, moment, pose.sensitivity.T))
-    variance = covariance.diagonal().reshape(2, 3).mean(axis=1)  # of position and rotation, each about one axis
-    covariance = covariance + np.diag(np.repeat(IMPRECISION**2 * variance, 3))
     covariance[:3, :3] += np.outer(scaled, scaled)
     return covariance
+
+
+def sensitivity_covariance(sensitivity: F64, information: F64, score: F64) -> F64:
+    """Covariance (6, 6) of an error of the calibration's parameters times a `sensitivity` (6, 12), given the evidence of residuals, `information`
+    (12, 12) and `score` (12,).
+
+    The sensitivity is known to a share, `IMPRECISION`, by which position and rotation err in any direction: along its own columns alone the error
+    would be taken to be exact in all others."""
+    covariance = np.asarray(matmul(sensitivity, calibration_moment(information, score), sensitivity.T))
+    variance = covariance.diagonal().reshape(2, 3).mean(axis=1)  # of position and rotation, each about one axis
+    return covariance + np.diag(np.repeat(IMPRECISION**2 * variance, 3))

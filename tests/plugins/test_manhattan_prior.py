@@ -24,6 +24,7 @@ CAMERA = Camera(640, 480, 525.0, 520.0, 319.5, 239.5)
 KEYFRAMES, STEP_M = 64, 0.5
 AXES = exp_so3(np.array([0.3, -0.4, 0.1]))  # R_world_manhattan
 DRIFT = np.radians([0.1, 0.7, -0.2])  # at the end of the walk
+EXACT = np.zeros((6, CALIBRATION))  # a loop that the calibration does not touch
 
 
 def corridor(drift, axes=(0, 1, 2), turned=0.0, wall_deg=0.1, back=False):
@@ -227,7 +228,7 @@ def test_a_loop_corrects_keyframes_as_they_would_be_without_alignment():
     aligned = apply_correction(raw, dataclasses.replace(correct_keyframes(raw, every, before, moved), **columns))
     T, none = before[-1] @ exp_se3(np.array([0.03, -0.05, 0.02, 0.003, 0.004, -0.005])), np.empty(0, np.uint8)
     found = PoseSolution(T, 1e-8 * np.eye(6), np.empty((6, 0)), none, none, none, 0.0)
-    closed, expected = (correct_loop(PlanesLoop(), map, 0, found, None) for map in (aligned, raw))
+    closed, expected = (correct_loop(PlanesLoop(), map, 0, found, EXACT, None) for map in (aligned, raw))
     without = closed.T_world_keyframe @ np.array([exp_se3(-xi) for xi in closed.aligned])
     assert np.abs(invert(moved) @ closed.T_world_keyframe - np.eye(4)).max() > 0.03
     assert without == pytest.approx(expected.T_world_keyframe, abs=5e-4)
@@ -244,12 +245,53 @@ def test_a_closed_loop_leaves_no_error_of_the_calibration_where_it_closes():
     map = dataclasses.replace(map, keyframes=map.keyframes.updated(np.arange(KEYFRAMES), sensitivity=sensitivity))
     T, none = map.keyframes.row("T_world_camera", KEYFRAMES - 1), np.empty(0, np.uint8)
     found = PoseSolution(T, 1e-8 * np.eye(6), np.empty((6, 0)), none, none, none, 0.0)
-    left = correct_loop(PlanesLoop(), map, 0, found, None).sensitivity
+    left = correct_loop(PlanesLoop(), map, 0, found, EXACT, None).sensitivity
     before = np.linalg.norm(sensitivity[:, :, 3], axis=1)
     assert left.shape == sensitivity.shape and not np.delete(left, 3, axis=2).any()
     after = np.linalg.norm(left[:, :, 3], axis=1)
     assert after[-1] < 0.01 * before[-1] and after[0] == 0.0 and after.max() < before[-1]
     assert left[-1] == pytest.approx(0.0, abs=1e-3)
+
+
+def closing(map, motion=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)):
+    """A loop that finds the newest keyframe where the map has it, but for a motion."""
+    T, none = map.keyframes.row("T_world_camera", KEYFRAMES - 1) @ exp_se3(np.array(motion)), np.empty(0, np.uint8)
+    return PoseSolution(T, 1e-8 * np.eye(6), np.empty((6, 0)), none, none, none, 0.0)
+
+
+def test_a_loop_leaves_its_own_error_of_the_calibration():
+    """The keyframes err by 0.3 m at the end, the loop by 2 mm: so does then the newest keyframe, and a loop that errs by 0.2 m moves it by little."""
+    map, _ = corridor(np.zeros(3))
+    sensitivity = np.zeros((KEYFRAMES, 6, CALIBRATION))
+    sensitivity[:, 0, 3] = np.linspace(0.0, 0.3, KEYFRAMES)
+    map = dataclasses.replace(map, keyframes=map.keyframes.updated(np.arange(KEYFRAMES), sensitivity=sensitivity))
+    error = EXACT.copy()
+    error[0, 3] = 0.002
+    left = correct_loop(PlanesLoop(), map, 0, closing(map), error, None).sensitivity[-1]
+    assert left[:, 3] == pytest.approx([0.002, 0.0, 0.0, 0.0, 0.0, 0.0], abs=6e-4)
+    motion = np.array([0.1, 0.0, 0.0, 0.0, 0.0, 0.0])
+    before = map.keyframes.row("T_world_camera", KEYFRAMES - 1)
+    for size, share in ((0.0, 1.0), (1.0, 0.0)):
+        moved = correct_loop(PlanesLoop(), map, 0, closing(map, motion), 100.0 * size * error, None).T_world_keyframe[-1]
+        assert log_se3(invert(before) @ moved)[0] == pytest.approx(0.1 * share, abs=0.02)
+
+
+def test_what_is_known_of_the_calibration_is_undone_in_a_loop():
+    """A loop that errs by an error of the calibration that the last alignment has found closes as an exact one would, and what the keyframes would be
+    without alignment as it was measured."""
+    map, _ = corridor(np.zeros(3))
+    error, found = EXACT.copy(), np.zeros(CALIBRATION)
+    error[:, 2], found[2] = [0.01, 0.0, 0.005, 0.0, np.radians(0.1), 0.0], 1.5
+    known = dataclasses.replace(map, calibration_errors=found)
+    measured = closing(map, -1.5 * error[:, 2])  # where undoing the error brings it to the map's pose
+    corrected, plain = correct_loop(PlanesLoop(), known, 0, measured, error, None), correct_loop(PlanesLoop(), map, 0, measured, error, None)
+    before = map.keyframes.column("T_world_camera")
+    assert np.abs(invert(before) @ corrected.T_world_keyframe - np.eye(4)).max() < 1e-6
+    without = corrected.T_world_keyframe @ np.array([exp_se3(-xi) for xi in corrected.aligned])
+    assert without == pytest.approx(plain.T_world_keyframe, abs=1e-6)
+    assert np.abs(invert(before) @ without - np.eye(4))[-1].max() > 0.01
+    errors = corrected.sensitivity + corrected.undone_sensitivity
+    assert corrected.undone[-1] == pytest.approx(1.5 * errors[-1, :, 2], abs=1e-6)
 
 
 def test_visits_are_told_apart_by_what_keyframes_share():
